@@ -1,0 +1,130 @@
+"""From a configuration to the things it names."""
+
+from collections.abc import Callable
+from functools import partial
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from brax.envs.base import Env
+
+from dgae_jax import train
+from dgae_jax.algorithms import TABLE
+from dgae_jax.config import Config, CriticConfig, PolicyConfig, resolve
+from dgae_jax.envs.registry import make_env
+from dgae_jax.networks import gaussian_policy
+from dgae_jax.normalizers import normalize
+from dgae_jax.types import Algorithm, Policy, TrainState
+from dgae_jax.updates import Loss, adam, sgd, surrogate
+
+
+def make_task(config: Config) -> Env:
+    """The environment a configuration names."""
+    return make_env(config.env, physics=config.physics, version=config.env_version)
+
+
+def make_policy(env: Env, config: Config) -> Policy:
+    """The policy network a configuration describes, sized for `env`."""
+    settings = config.policy
+    return gaussian_policy(
+        _size(env), env.action_size, hidden=settings.hidden, covariance=settings.covariance, initial_std=settings.initial_std
+    )
+
+
+def make_algorithm(name: str, env: Env, config: Config) -> Algorithm:
+    """The record of parts that `name` stands for, sized for `env`.
+
+    Raises ValueError, naming what exists, for an unknown name.
+    """
+    if name not in TABLE:
+        raise ValueError(f"unknown algorithm {name!r}; choose from {', '.join(TABLE)}")
+    row, policy, settings = TABLE[name], make_policy(env, config), resolve(config).critic
+    options = {option: getattr(settings, option) for option in row.critic_options}
+    critic = row.critic(_size(env), hidden=settings.hidden, target=settings.target, **options)
+    return Algorithm(
+        policy=policy,
+        critic=critic,
+        residual=row.residual,
+        improve=_fit(surrogate(policy, config.policy.clip), config.policy, config),
+        evaluate=_fit(critic.loss, config.critic, config),
+    )
+
+
+def make_train(
+    algorithm: Algorithm, env: Env, config: Config
+) -> tuple[Callable[[jax.Array], TrainState], Callable[[TrainState], tuple[TrainState, train.Metrics]]]:
+    """`init(key) -> state` and `train_step(state) -> (state, metrics)`: see `train.make_train`."""
+    return train.make_train(
+        algorithm,
+        env,
+        num_envs=config.num_envs,
+        horizon=config.horizon,
+        episode_length=config.episode_length,
+        gamma=config.gamma,
+        lam=config.lam,
+        normalize_observations=config.normalize_observations,
+        normalize_rewards=config.normalize_rewards,
+    )
+
+
+def _size(env: Env) -> int:
+    return int(env.observation_size)  # pyright: ignore[reportArgumentType]
+
+
+def _fit(loss: Loss, settings: PolicyConfig | CriticConfig, config: Config):
+    steps = config.total_steps / config.samples * settings.epochs * settings.minibatches
+    optimizer = adam(
+        settings.learning_rate, final_fraction=settings.learning_rate_end, gradient_steps=steps, max_norm=settings.max_grad_norm
+    )
+    return sgd(loss, optimizer, epochs=settings.epochs, minibatches=settings.minibatches)
+
+
+class Trainer(NamedTuple):
+    """The compiled programs of a run, over all its seeds at once; every leaf of the state has a leading seed axis."""
+
+    init: Callable[[Config, jax.Array], TrainState]
+    """`init(config, keys [S]) -> state`."""
+    dispatch: Callable[[Config, TrainState, int], tuple[TrainState, train.Metrics]]
+    """`dispatch(config, state, count) -> (state, metrics [capacity, S])`: `count <= capacity` iterations; rows from
+    `count` on are zero. The state handed in is consumed."""
+
+
+def make_trainer(env: Env, capacity: int) -> Trainer:
+    """Compile once, run any number of iterations per call; the floats of the configuration may change between calls."""
+
+    def parts(config: Config):
+        return make_train(make_algorithm(config.algo, env, config), env, config)
+
+    @jax.jit
+    def init(config: Config, keys: jax.Array) -> TrainState:
+        return jax.vmap(parts(config)[0])(keys)
+
+    @partial(jax.jit, donate_argnums=1)
+    def dispatch(config: Config, state: TrainState, count: int):
+        step = jax.jit(jax.vmap(parts(config)[1]))  # jitted, so that asking for its shapes does not trace it twice
+        rows = jax.tree.map(lambda x: jnp.zeros((capacity, *x.shape), x.dtype), jax.eval_shape(step, state)[1])
+
+        def iteration(i, carry):
+            state, rows = carry
+            state, row = step(state)
+            return state, jax.tree.map(lambda all, one: all.at[i].set(one), rows, row)
+
+        return jax.lax.fori_loop(0, count, iteration, (state, rows))
+
+    return Trainer(init, dispatch)
+
+
+def seed_keys(config: Config) -> jax.Array:
+    """One key per run: `key(seed)`, `key(seed + 1)`, …"""
+    return jnp.stack([jax.random.key(config.seed + i) for i in range(config.num_seeds)])
+
+
+def make_greedy(env: Env, config: Config) -> Callable[[TrainState, jax.Array], jax.Array]:
+    """`greedy(state, obs [..., O]) -> action [..., A]`: the mean action of one trained run, within the actuators' range."""
+    policy, (low, high) = make_policy(env, config), env.action_range
+
+    def greedy(state: TrainState, obs: jax.Array) -> jax.Array:
+        distribution = policy.apply(state.policy.params, normalize(state.observations, obs))
+        return jnp.clip(distribution.mean, low, high)
+
+    return greedy

@@ -1,0 +1,240 @@
+"""What a run is: every number that decides its result, with its unit and what is allowed.
+
+The dataclasses are pytrees whose floats and sample budget are leaves: they may be traced, so a sweep over them is one
+compiled program, and changing one does not compile again. Everything else is static.
+"""
+
+import dataclasses
+import math
+from dataclasses import dataclass, field, fields
+from typing import Any
+
+import jax
+
+from dgae_jax.algorithms import TABLE
+from dgae_jax.critics import TARGETS
+from dgae_jax.envs.registry import PHYSICS, TASKS, VERSIONS
+from dgae_jax.networks import COVARIANCES
+
+LARGEST_BUDGET = 2**31 - 1
+
+
+class ConfigError(ValueError):
+    """A setting that cannot be; the message names the flag, the value and what is allowed."""
+
+
+def _traced(*names: str):
+    """Register a dataclass as a pytree whose leaves are the fields `names` and nested configurations."""
+
+    def register(cls):
+        rest = [f.name for f in fields(cls) if f.name not in names]
+        return jax.tree_util.register_dataclass(cls, data_fields=list(names), meta_fields=rest)
+
+    return register
+
+
+@_traced("learning_rate", "learning_rate_end", "max_grad_norm", "clip", "initial_std")
+@dataclass(frozen=True)
+class PolicyConfig:
+    """The policy network and how it improves."""
+
+    hidden: tuple[int, ...] = (64, 64)
+    """Width of each hidden layer [units]."""
+    covariance: str = "shared"
+    """Where the actions' deviation comes from: shared (one learned vector) or state (an output of the network)."""
+    initial_std: float = 1.0
+    """Deviation of the first actions [units of the action]."""
+    clip: float = 0.2
+    """PPO's clip range epsilon of the probability ratio [1]."""
+    learning_rate: float = 3e-4
+    """Adam's learning rate at the start [1]."""
+    learning_rate_end: float = 1.0
+    """Learning rate at the end of the run as a fraction of its start: 1 constant, 0 linear decay to zero [1]."""
+    epochs: int = 10
+    """Passes over each rollout [1]."""
+    minibatches: int = 32
+    """Gradient steps per pass; must divide num_envs * horizon [1]."""
+    max_grad_norm: float = 0.5
+    """Largest global norm of a gradient [1]."""
+
+
+@_traced("learning_rate", "learning_rate_end", "max_grad_norm", "kappa")
+@dataclass(frozen=True)
+class CriticConfig:
+    """The value network and what it is fitted to."""
+
+    hidden: tuple[int, ...] = (64, 64)
+    """Width of each hidden layer [units]."""
+    target: str = "default"
+    """bellman, bellman-frozen, lambda-shift, sr-lambda or lambda-return; default: the algorithm's own."""
+    quantiles: int = 64
+    """Quantiles K of a distributional critic [1]."""
+    kappa: float = 1.0
+    """Threshold of the quantile-Huber loss of a distributional critic [units of the scaled return]."""
+    learning_rate: float = 3e-4
+    """Adam's learning rate at the start [1]."""
+    learning_rate_end: float = 1.0
+    """Learning rate at the end of the run as a fraction of its start: 1 constant, 0 linear decay to zero [1]."""
+    epochs: int = 10
+    """Passes over each rollout [1]."""
+    minibatches: int = 32
+    """Gradient steps per pass; must divide num_envs * horizon [1]."""
+    max_grad_norm: float = 0.5
+    """Largest global norm of a gradient [1]."""
+
+
+@_traced("gamma", "lam", "total_steps", "policy", "critic")
+@dataclass(frozen=True)
+class Config:
+    """One training run."""
+
+    env: str = "hopper"
+    """Task: hopper."""
+    env_version: str = "v4"
+    """Gymnasium version whose semantics the task has: v4 (the same as Gym's v3)."""
+    algo: str = "dppo"
+    """Algorithm: ppo or dppo."""
+    physics: str = "mjx"
+    """Engine that simulates the task: mjx (compiled by JAX, CPU or GPU) or native (C MuJoCo, CPU)."""
+    seed: int = 0
+    """Seed of the first run; the others follow by one [1]."""
+    num_seeds: int = 1
+    """Independent runs trained side by side in one program [runs]."""
+    total_steps: int = 1_000_000
+    """Sample budget of each run, never exceeded [environment steps]."""
+    num_envs: int = 16
+    """Worlds simulated in parallel [worlds]."""
+    horizon: int = 128
+    """Rollout length of each world per iteration [environment steps]."""
+    episode_length: int = 1000
+    """Time limit of an episode, a truncation [environment steps]."""
+    gamma: float = 0.99
+    """Discount factor, 0 to 1 [per environment step]."""
+    lam: float = 0.95
+    """Lambda of GAE and of the critic's lambda targets, 0 to 1 [1]."""
+    normalize_observations: bool = True
+    """Subtract the running mean of observations and divide by their deviation."""
+    normalize_rewards: bool = True
+    """Divide rewards by the running deviation of the discounted return."""
+    policy: PolicyConfig = field(default_factory=PolicyConfig)
+    critic: CriticConfig = field(default_factory=CriticConfig)
+
+    @property
+    def samples(self) -> int:
+        """Samples per iteration and run."""
+        return self.num_envs * self.horizon
+
+    @property
+    def iterations(self) -> int:
+        """The largest whole number of iterations within the budget."""
+        return self.total_steps // self.samples
+
+
+def flag(path: str) -> str:
+    """The command-line spelling of a field."""
+    return "--" + path.replace("_", "-")
+
+
+def _check(path: str, value: Any, ok: bool, allowed: str) -> None:
+    if not ok:
+        shown = " ".join(map(str, value)) if isinstance(value, tuple) else value
+        raise ConfigError(f"{flag(path)} {shown}: must be {allowed}")
+
+
+def _choice(path: str, value: str, table: Any) -> None:
+    _check(path, value, value in table, f"one of {', '.join(table)}")
+
+
+def _positive(path: str, value: int) -> None:
+    _check(path, value, value >= 1, "a whole number of at least 1")
+
+
+def _between(path: str, value: float, low: float, high: float) -> None:
+    _check(path, value, low <= value <= high, f"a number from {low:g} to {high:g}")
+
+
+def _above_zero(path: str, value: float) -> None:
+    _check(path, value, value > 0 and math.isfinite(value), "a finite number above 0")
+
+
+def validate(config: Config) -> None:
+    """Raise `ConfigError` for the first setting that cannot be, alone or together with the others."""
+    _choice("env", config.env, TASKS)
+    _choice("env_version", config.env_version, VERSIONS)
+    _choice("algo", config.algo, TABLE)
+    _choice("physics", config.physics, PHYSICS)
+    _between("seed", config.seed, 0, 2**32 - 1)
+    for name in ("num_seeds", "total_steps", "num_envs", "horizon", "episode_length"):
+        _positive(name, getattr(config, name))
+    _check("total_steps", config.total_steps, config.total_steps <= LARGEST_BUDGET, f"at most {LARGEST_BUDGET:,}")
+    _between("gamma", config.gamma, 0, 1)
+    _between("lam", config.lam, 0, 1)
+    _choice("policy.covariance", config.policy.covariance, COVARIANCES)
+    _choice("critic.target", config.critic.target, ("default", *TARGETS))
+    _positive("critic.quantiles", config.critic.quantiles)
+    for name in ("policy.clip", "policy.initial_std", "critic.kappa"):
+        part, leaf = name.split(".")
+        _above_zero(name, getattr(getattr(config, part), leaf))
+    for part in ("policy", "critic"):
+        _validate_fit(config, part)
+    for name in set(_CRITIC_OPTIONS) - set(TABLE[config.algo].critic_options):
+        value = getattr(config.critic, name)
+        _check(f"critic.{name}", value, value == _CRITIC_OPTIONS[name], f"left out: {config.algo} does not use it")
+    if config.iterations < 1:
+        _check("total_steps", config.total_steps, False, f"at least one iteration of num_envs * horizon = {config.samples:,} samples")
+
+
+def _validate_fit(config: Config, part: str) -> None:
+    settings = getattr(config, part)
+    _check(f"{part}.hidden", settings.hidden, len(settings.hidden) >= 1 and min(settings.hidden) >= 1, "one or more widths of at least 1")
+    _above_zero(f"{part}.learning_rate", settings.learning_rate)
+    _between(f"{part}.learning_rate_end", settings.learning_rate_end, 0, 1)
+    _above_zero(f"{part}.max_grad_norm", settings.max_grad_norm)
+    _positive(f"{part}.epochs", settings.epochs)
+    _positive(f"{part}.minibatches", settings.minibatches)
+    divides = config.samples % settings.minibatches == 0
+    _check(f"{part}.minibatches", settings.minibatches, divides, f"a divisor of num_envs * horizon = {config.samples:,}")
+
+
+_CRITIC_OPTIONS = {name: getattr(CriticConfig(), name) for name in {o for row in TABLE.values() for o in row.critic_options}}
+
+
+def resolve(config: Config) -> Config:
+    """The configuration with the algorithm's defaults written out."""
+    target = TABLE[config.algo].target if config.critic.target == "default" else config.critic.target
+    return dataclasses.replace(config, critic=dataclasses.replace(config.critic, target=target))
+
+
+def to_dict(config: Config) -> dict[str, Any]:
+    """Plain data for JSON."""
+    return dataclasses.asdict(config)
+
+
+def from_dict(data: dict[str, Any]) -> Config:
+    """The configuration written by `to_dict`; raises `ConfigError` for missing or unknown names and wrong types."""
+    return _from_dict(Config, data, "")
+
+
+def _from_dict(cls, data: Any, prefix: str):
+    if not isinstance(data, dict):
+        raise ConfigError(f"{prefix or 'configuration'}: must be an object, not {data!r}")
+    default = {f.name: getattr(cls(), f.name) for f in fields(cls)}
+    for name in sorted(set(data) ^ set(default)):
+        raise ConfigError(f"{prefix}{name}: {'unknown' if name in data else 'missing'}")
+    return cls(**{name: _value(data[name], like, prefix + name) for name, like in default.items()})
+
+
+def _value(value: Any, like: Any, path: str):
+    if dataclasses.is_dataclass(like):
+        return _from_dict(type(like), value, path + ".")
+    if isinstance(like, tuple):
+        ok = isinstance(value, list | tuple) and all(type(v) is int for v in value)
+        value = tuple(value) if ok else value
+    elif isinstance(like, float):
+        ok = type(value) in (int, float)
+        value = float(value) if ok else value
+    else:
+        ok = type(value) is type(like)
+    if not ok:
+        raise ConfigError(f"{path}: must be {type(like).__name__}, not {value!r}")
+    return value

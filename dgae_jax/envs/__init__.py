@@ -1,0 +1,1 @@
+"""The tasks, as Brax environments: see `gym_tasks`, and `registry` for their names."""

@@ -1,0 +1,1 @@
+"""Where the library meets the machine: files, clock, terminal, Gymnasium."""

@@ -1,0 +1,39 @@
+"""Command lines: flags from dataclasses, and one clear line for a user's mistake."""
+
+import contextlib
+import io
+import re
+import sys
+from collections.abc import Sequence
+from typing import NoReturn, TypeVar
+
+import tyro
+
+T = TypeVar("T")
+
+_FRAME = re.compile(r"[╭╮╰╯│─|+]|-{3,}")
+
+
+def fail(message: str) -> NoReturn:
+    """One line on stderr, exit code 2."""
+    print(f"error: {message}", file=sys.stderr)
+    raise SystemExit(2)
+
+
+def parse(cls: type[T], description: str, argv: Sequence[str] | None = None) -> T:
+    """The dataclass `cls` filled from the command line; `--help` explains every field."""
+    screen = io.StringIO()
+    try:
+        with contextlib.redirect_stderr(screen):
+            return tyro.cli(cls, description=description, args=argv)
+    except SystemExit as stop:
+        if stop.code in (0, None):
+            raise
+        fail(_one_line(screen.getvalue()))
+
+
+def _one_line(box: str) -> str:
+    """The sentence inside tyro's framed message, without title, frame and pointer to the help text."""
+    lines = [_FRAME.sub(" ", line).strip() for line in box.splitlines()[1:]]
+    body = " ".join(line for line in lines if line).partition("For full helptext")[0]
+    return re.sub(r"\s+", " ", body).strip() + " (--help lists every flag)"

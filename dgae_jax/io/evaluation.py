@@ -1,0 +1,74 @@
+"""What a trained policy is worth: episodes of its mean action in one of three engines."""
+
+import dataclasses
+import warnings
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+
+from dgae_jax.build import make_greedy, make_task
+from dgae_jax.config import Config
+from dgae_jax.envs.registry import TASKS
+from dgae_jax.io import checkpoint
+from dgae_jax.rollout import evaluate
+from dgae_jax.types import TrainState
+
+ENGINES = ("gymnasium", "native", "mjx")
+
+
+def evaluate_state(state: TrainState, config: Config, *, engine: str, episodes: int, seed: int = 0) -> dict[str, Any]:
+    """Undiscounted returns of every run in `state`; mean and standard deviation are over all their episodes."""
+    run = _in_gymnasium if engine == "gymnasium" else _in_jax
+    greedy = jax.jit(make_greedy(make_task(config), config))
+    states = [jax.tree.map(lambda x, i=i: x[i], state) for i in range(config.num_seeds)]
+    per_run = [run(one, greedy, config, engine, episodes, seed) for one in states]
+    return {
+        "engine": engine,
+        "env": TASKS[config.env].REFEREE,
+        "episodes": episodes * config.num_seeds,
+        **_summary(np.concatenate(per_run)),
+        "seeds": [{"seed": config.seed + i, **_summary(returns)} for i, returns in enumerate(per_run)],
+    }
+
+
+def evaluate_run(run_dir: Path, config: Config, *, engine: str, episodes: int, seed: int = 0) -> dict[str, Any]:
+    """`evaluate_state` for the newest checkpoint of a run."""
+    newest = checkpoint.latest(run_dir)
+    state = checkpoint.load(newest, config)
+    return {**evaluate_state(state, config, engine=engine, episodes=episodes, seed=seed), "checkpoint": newest.name}
+
+
+def _summary(returns: np.ndarray) -> dict[str, Any]:
+    return {"return_mean": float(returns.mean()), "return_std": float(returns.std()), "returns": [round(float(r), 4) for r in returns]}
+
+
+def _in_jax(state: TrainState, greedy, config: Config, engine: str, episodes: int, seed: int) -> np.ndarray:
+    env = make_task(dataclasses.replace(config, physics=engine))
+
+    @jax.jit
+    def returns(state: TrainState, key: jax.Array):
+        return evaluate(env, lambda obs: greedy(state, obs), key, episodes=episodes, episode_length=config.episode_length)
+
+    return np.asarray(returns(state, jax.random.key(seed)), np.float64)
+
+
+def _in_gymnasium(state: TrainState, greedy, config: Config, engine: str, episodes: int, seed: int) -> np.ndarray:
+    """Gymnasium's own task in C MuJoCo, the referee: episodes side by side, one batched policy call per step."""
+    import gymnasium  # here, so that training alone does not import it
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # that v4 is not the newest version is known
+        worlds = [gymnasium.make(TASKS[config.env].REFEREE, max_episode_steps=config.episode_length) for _ in range(episodes)]
+    obs = np.stack([world.reset(seed=seed + i)[0] for i, world in enumerate(worlds)])
+    total, alive = np.zeros(episodes), np.full(episodes, True)
+    while alive.any():
+        actions = np.asarray(greedy(state, obs.astype(np.float32)))
+        for i in np.flatnonzero(alive):
+            obs[i], reward, terminated, truncated, _ = worlds[i].step(actions[i])
+            total[i] += float(reward)
+            alive[i] = not (terminated or truncated)
+    for world in worlds:
+        world.close()
+    return total

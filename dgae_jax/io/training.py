@@ -1,0 +1,156 @@
+"""A run from its configuration to its evaluation, on disk."""
+
+import signal
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+
+from dgae_jax.build import make_task, make_trainer, seed_keys
+from dgae_jax.config import Config, ConfigError, resolve, validate
+from dgae_jax.io import checkpoint, metrics, plots, run_directory
+from dgae_jax.io.evaluation import evaluate_state
+from dgae_jax.io.progress import Reporter
+from dgae_jax.types import TrainState
+
+CAPACITY = 64
+"""Most iterations in one dispatch."""
+DISPATCH_SECONDS = 2.0
+"""Aim for the time between looks at metrics, clock and signals."""
+
+
+@dataclass(frozen=True)
+class RunOptions:
+    """What a run leaves on this machine; nothing here changes its result."""
+
+    run_dir: Path | None = None
+    """Directory to write, new or empty; by default runs/ENV-ALGO-SEED-TIME [path]."""
+    cache_dir: str = "~/.cache/dgae_jax"
+    """Where compiled programs are kept between runs; none disables [path]."""
+    checkpoint_every: int = 200_000
+    """Samples of each run between checkpoints; one is always saved at the end [environment steps]."""
+    episodes: int = 20
+    """Episodes of the final evaluation in Gymnasium, per run [episodes]."""
+
+
+def validate_options(options: RunOptions) -> None:
+    """Raise `ConfigError` for the first option that cannot be."""
+    for flag, value in (("--checkpoint-every", options.checkpoint_every), ("--episodes", options.episodes)):
+        if value < 1:
+            raise ConfigError(f"{flag} {value}: must be a whole number of at least 1")
+
+
+def train(config: Config, options: RunOptions) -> int:
+    """Train, evaluate, and write the run directory; the process's exit code: 0, or 130 / 143 after a signal.
+
+    Raises ConfigError before anything is written or compiled if the configuration or a path cannot be.
+    """
+    validate(config)
+    validate_options(options)
+    config = resolve(config)
+    run_dir = options.run_dir or run_directory.default_path(config)
+    use_cache(options.cache_dir)
+    run_directory.create(run_dir, config)
+    print(_budget(config))
+    if config.physics == "mjx" and jax.default_backend() == "cpu":
+        print("no accelerator: --physics native starts and runs faster here")
+    with _Signals() as signals:
+        state = _iterate(config, options, run_dir, signals)
+    if signals.received:
+        print(f"stopped by {signals.received.name}; checkpoint saved in {run_dir}", flush=True)
+        return 128 + signals.received
+    return _evaluate(state, config, options.episodes, run_dir)
+
+
+def use_cache(cache_dir: str) -> None:
+    """Keep compiled programs in `cache_dir`, or nowhere if it is "none"; raises ConfigError if it cannot be written."""
+    if cache_dir == "none":
+        jax.config.update("jax_enable_compilation_cache", False)
+        return
+    path = Path(cache_dir).expanduser()
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except OSError as reason:
+        raise ConfigError(f"--cache-dir {cache_dir}: must be a directory that can be written, or none ({reason.strerror})") from reason
+    jax.config.update("jax_compilation_cache_dir", str(path))
+
+
+def _budget(config: Config) -> str:
+    runs = f" × {config.num_seeds} seeds" if config.num_seeds > 1 else ""
+    used = f"{config.iterations:,} iterations × {config.samples:,} samples = {config.iterations * config.samples:,}"
+    return f"{config.env}-{config.env_version} {config.algo} on {config.physics}: {used} of {config.total_steps:,} steps{runs}"
+
+
+def _iterate(config: Config, options: RunOptions, run_dir: Path, signals: "_Signals") -> TrainState:
+    """All iterations, dispatch by dispatch, until the budget is used or a signal came."""
+    trainer = make_trainer(make_task(config), CAPACITY)
+    file = metrics.MetricsFile(run_dir / "metrics.jsonl", config.seed, config.samples)
+    every = max(1, options.checkpoint_every // config.samples)
+    began, done, count, rows = time.monotonic(), 0, 1, []
+    reporter = Reporter(config.iterations * config.samples, config.num_seeds)
+    try:
+        state = trainer.init(config, seed_keys(config))
+        while done < config.iterations and not signals.received:
+            count = min(count, config.iterations - done, every - done % every)
+            since = time.monotonic()
+            state, measured = trainer.dispatch(config, state, count)
+            new = file.append(measured, count, time.monotonic() - began)
+            seconds, first = (time.monotonic() - since) / count, done == 0
+            rows, done = rows + new, done + count
+            returns = [row["episode_return"] for row in new[-config.num_seeds :] if row["episode_return"] is not None]
+            mean = float(np.mean(returns)) if returns else None
+            if first:  # it also compiled, so it says nothing about speed
+                count = 1
+            else:
+                reporter.update(done * config.samples, config.samples / seconds, mean)
+                count = int(np.clip(DISPATCH_SECONDS / seconds, 1, CAPACITY))
+            if done % every == 0 or done == config.iterations or signals.received:
+                _save(state, rows, config, run_dir, done * config.samples)
+    finally:
+        reporter.close()
+    return state
+
+
+def _save(state: TrainState, rows: list[dict[str, Any]], config: Config, run_dir: Path, steps: int) -> None:
+    checkpoint.save(run_dir / "checkpoints", state, steps)
+    title = f"{config.env}-{config.env_version}, {config.algo}, {config.physics}"
+    plots.save(plots.learning_curve(rows, title), run_dir / "curve.png")
+
+
+def _evaluate(state: TrainState, config: Config, episodes: int, run_dir: Path) -> int:
+    result = evaluate_state(state, config, engine="gymnasium", episodes=episodes)
+    run_directory.write_json(run_dir / "evaluation.json", result)
+    print(f"{describe(result)}; files in {run_dir}", flush=True)
+    return 0
+
+
+def describe(result: dict[str, Any]) -> str:
+    """An evaluation in one line."""
+    return (
+        f"return {result['return_mean']:,.1f} ± {result['return_std']:,.1f} over {result['episodes']} episodes"
+        f" of the deterministic policy in {result['env']} ({result['engine']})"
+    )
+
+
+class _Signals:
+    """Notes the first SIGINT or SIGTERM, so that the running dispatch can finish; a second one acts at once."""
+
+    def __init__(self):
+        self.received: signal.Signals | None = None
+        self.before: dict[signal.Signals, Any] = {}
+
+    def __enter__(self) -> "_Signals":
+        self.before = {kind: signal.signal(kind, self._note) for kind in (signal.SIGINT, signal.SIGTERM)}
+        return self
+
+    def __exit__(self, *_) -> None:
+        for kind, handler in self.before.items():
+            signal.signal(kind, handler)
+
+    def _note(self, kind: int, _) -> None:
+        self.received = signal.Signals(kind)
+        for each in self.before:
+            signal.signal(each, signal.SIG_DFL)

@@ -1,0 +1,94 @@
+"""One training iteration as one pure function: roll out, estimate advantages, improve the policy, fit the critic."""
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from brax.envs.base import Env
+from jaxtyping import Array, Key
+
+from dgae_jax import gaussian, normalizers
+from dgae_jax.returns import decay, lambda_sum
+from dgae_jax.rollout import rollout, start
+from dgae_jax.statistics import explained_variance
+from dgae_jax.types import Algorithm, Batch, Fit, TrainState, Transition
+
+Metrics = dict[str, Array]
+
+
+def make_train(
+    algorithm: Algorithm,
+    env: Env,
+    *,
+    num_envs: int,
+    horizon: int,
+    episode_length: int,
+    gamma: Any,
+    lam: Any,
+    normalize_observations: bool,
+    normalize_rewards: bool,
+) -> tuple[Callable[[Array], TrainState], Callable[[TrainState], tuple[TrainState, Metrics]]]:
+    """`init(key) -> state` and `train_step(state) -> (state, metrics)` (Algorithm policy_value_update).
+
+    Both are pure; jit, scan and vmap them. One step consumes `num_envs * horizon` samples. γ and λ may be traced.
+    """
+
+    def init(key: Key[Array, ""]) -> TrainState:
+        policy_key, critic_key, env_key, key = jax.random.split(key, 4)
+        policy, critic = algorithm.policy.init(policy_key), algorithm.critic.init(critic_key)
+        return TrainState(
+            policy=Fit(policy, algorithm.improve.init(policy)),
+            critic=Fit(critic, algorithm.evaluate.init(critic)),
+            observations=normalizers.observations(int(env.observation_size)),  # pyright: ignore[reportArgumentType]
+            returns=normalizers.return_scale(num_envs),
+            episodes=start(env, env_key, num_envs),
+            key=key,
+            iteration=jnp.int32(0),
+        )
+
+    def act_with(state: TrainState):
+        def act(key, obs):
+            distribution = algorithm.policy.apply(state.policy.params, normalizers.normalize(state.observations, obs))
+            action = gaussian.sample(key, distribution)
+            return action, gaussian.log_prob(distribution, action)
+
+        return act
+
+    def learn_from(state: TrainState, step: Transition, reward: Array, key: Array) -> tuple[Batch, Metrics]:
+        obs, next_obs = (normalizers.normalize(state.observations, x) for x in (step.obs, step.next_obs))
+        quantiles, next_quantiles = (algorithm.critic.predict(state.critic.params, x) for x in (obs, next_obs))
+        discount, trace = decay(step.terminated, step.truncated, gamma=gamma, lam=lam)
+        residual = algorithm.residual(reward, discount, quantiles, next_quantiles)
+        advantage = lambda_sum(residual, discount * trace)
+        target = algorithm.critic.target(key, reward, discount, trace, quantiles, next_quantiles)
+        standard = (advantage - advantage.mean()) / (advantage.std() + 1e-8)
+        batch = Batch(obs, step.action, step.log_prob, standard, target, reward, discount, next_obs)
+        value = quantiles.mean(-1)
+        metrics = {"critic/value": value.mean(), "critic/explained_variance": explained_variance(value, value + advantage)}
+        return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), batch), metrics
+
+    @jax.default_matmul_precision("highest")  # TF32 ruins training on GPUs that default to it
+    def train_step(state: TrainState) -> tuple[TrainState, Metrics]:
+        act_key, target_key, policy_key, critic_key, key = jax.random.split(state.key, 5)
+        episodes, step = rollout(env, act_with(state), state.episodes, act_key, horizon=horizon, episode_length=episode_length)
+        returns, reward = state.returns, step.reward
+        if normalize_rewards:
+            done = (step.terminated | step.truncated).astype(reward.dtype)
+            returns, reward = normalizers.rescale(returns, reward, done, gamma)
+        batch, estimates = learn_from(state, step, reward, target_key)
+        policy, improved = algorithm.improve.step(policy_key, state.policy, batch)
+        critic, evaluated = algorithm.evaluate.step(critic_key, state.critic, batch)
+        observations = normalizers.observe(state.observations, step.obs) if normalize_observations else state.observations
+        metrics = {
+            "episode_return": jnp.nanmean(episodes.last_total),
+            "episode_length": jnp.nanmean(episodes.last_steps),
+            "episodes": (step.terminated | step.truncated).sum(),
+            "reward": step.reward.mean(),
+            **{f"policy/{name}": value for name, value in improved.items()},
+            **{f"critic/{name}": value for name, value in evaluated.items()},
+            **estimates,
+        }
+        return TrainState(policy, critic, observations, returns, episodes, key, state.iteration + 1), metrics
+
+    return init, train_step

@@ -1,0 +1,102 @@
+"""The records that flow through the trainer: data, networks in training, and the parts of an algorithm.
+
+Leading axes: T time steps of a rollout, N parallel worlds, B = T·N flattened samples, K quantiles, A actions.
+"""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+from jaxtyping import Array, Bool, Float, Int, Key
+
+Params = Any
+"""A pytree of network parameters."""
+
+
+class Transition(NamedTuple):
+    """What a rollout leaves behind. `next_obs` is the true successor, never a reset observation."""
+
+    obs: Float[Array, "T N O"]
+    action: Float[Array, "T N A"]
+    log_prob: Float[Array, "T N"]
+    reward: Float[Array, "T N"]
+    terminated: Bool[Array, "T N"]
+    truncated: Bool[Array, "T N"]
+    next_obs: Float[Array, "T N O"]
+
+
+class Batch(NamedTuple):
+    """What the updates learn from; observations are normalised, rewards scaled.
+
+    `reward`, `discount` and `next_obs` are there for targets that follow the critic.
+    """
+
+    obs: Float[Array, "B O"]
+    action: Float[Array, "B A"]
+    log_prob: Float[Array, " B"]
+    advantage: Float[Array, " B"]
+    target: Float[Array, "B J"]
+    reward: Float[Array, " B"]
+    discount: Float[Array, " B"]
+    next_obs: Float[Array, "B O"]
+
+
+class Fit(NamedTuple):
+    """One network in training."""
+
+    params: Params
+    opt_state: Any
+
+
+class TrainState(NamedTuple):
+    """Everything an iteration reads and writes; the whole of a run."""
+
+    policy: Fit
+    critic: Fit
+    observations: Any
+    """Running mean and deviation of observations."""
+    returns: Any
+    """Running deviation of discounted returns, the scale of rewards."""
+    episodes: Any
+    """The worlds and the bookkeeping of their episodes."""
+    key: Key[Array, ""]
+    iteration: Int[Array, ""]
+
+
+class Policy(NamedTuple):
+    """`init(key) -> params`; `apply(params, obs [..., O]) -> Gaussian` over actions [..., A]."""
+
+    init: Callable
+    apply: Callable
+
+
+class Critic(NamedTuple):
+    """A value distribution: how it predicts, what it is fitted to, and how far off it is."""
+
+    init: Callable
+    """`init(key) -> params`."""
+    predict: Callable
+    """`predict(params, obs [..., O]) -> quantiles [..., K]`."""
+    target: Callable
+    """`target(key, reward, discount, trace, quantiles, next_quantiles) -> [T, N, J]`, frozen for the iteration."""
+    loss: Callable
+    """`loss(params, batch) -> (scalar, info)`."""
+
+
+class Update(NamedTuple):
+    """`init(params) -> opt_state`; `step(key, fit, batch) -> (fit, info)`."""
+
+    init: Callable
+    step: Callable
+
+
+class Algorithm(NamedTuple):
+    """A policy-gradient algorithm is this record; the six names of the paper are rows of one table."""
+
+    policy: Policy
+    critic: Critic
+    residual: Callable
+    """`residual(reward, discount, quantiles, next_quantiles) -> δ`, the one thing DGAE changes."""
+    improve: Update
+    """The policy step."""
+    evaluate: Update
+    """The critic fit."""

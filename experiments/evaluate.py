@@ -1,0 +1,52 @@
+"""Evaluate a trained run: python experiments/evaluate.py RUN_DIR --engine gymnasium --episodes 100"""
+
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import tyro
+
+from dgae_jax import ConfigError
+from dgae_jax.io import cli, run_directory
+from dgae_jax.io.checkpoint import CheckpointError
+from dgae_jax.io.evaluation import evaluate_run
+from dgae_jax.io.training import describe
+
+
+@dataclass(frozen=True)
+class Arguments:
+    """What to evaluate, and how."""
+
+    run_dir: tyro.conf.Positional[Path]
+    """Directory of the run [path]."""
+    engine: Literal["gymnasium", "native", "mjx"] = "gymnasium"
+    """gymnasium (the task of the gymnasium package), native (ours in C MuJoCo) or mjx (ours in JAX)."""
+    episodes: int = 20
+    """Episodes per trained run [episodes]."""
+    seed: int = 0
+    """Seed of the initial states [1]."""
+    out: Path | None = None
+    """File to write; by default evaluation-ENGINE.json in the run directory [path]."""
+
+
+def main() -> int:
+    """Evaluate one run directory; 0 done, 2 bad input."""
+    arguments = cli.parse(Arguments, "Evaluate the deterministic policy of a trained run.")
+    if arguments.episodes < 1:
+        cli.fail(f"--episodes {arguments.episodes}: must be a whole number of at least 1")
+    out = arguments.out or arguments.run_dir / f"evaluation-{arguments.engine}.json"
+    try:
+        config = run_directory.read_config(arguments.run_dir)
+        result = evaluate_run(arguments.run_dir, config, engine=arguments.engine, episodes=arguments.episodes, seed=arguments.seed)
+        run_directory.write_json(out, result)
+    except (ConfigError, CheckpointError) as mistake:
+        cli.fail(str(mistake))
+    except OSError as reason:
+        cli.fail(f"--out {out}: must be a file that can be written ({reason.strerror})")
+    print(f"{describe(result)}; written to {out}")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

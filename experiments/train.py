@@ -1,0 +1,32 @@
+"""Train a policy: python experiments/train.py --env hopper --algo dppo --physics native"""
+
+import sys
+from dataclasses import dataclass, field
+from typing import Annotated
+
+import tyro
+
+from dgae_jax import Config, ConfigError
+from dgae_jax.io import cli
+from dgae_jax.io.training import RunOptions, train
+
+
+@dataclass(frozen=True)
+class Arguments:
+    """What to train, and where to write it."""
+
+    config: Annotated[Config, tyro.conf.arg(name="")] = field(default_factory=Config)
+    run: Annotated[RunOptions, tyro.conf.arg(name="")] = field(default_factory=RunOptions)
+
+
+def main() -> int:
+    """Train one run directory; 0 done, 2 bad input, 130 / 143 stopped by a signal with a checkpoint saved."""
+    arguments = cli.parse(Arguments, "Train a policy on a MuJoCo task with PPO or its distributional variant.")
+    try:
+        return train(arguments.config, arguments.run)
+    except ConfigError as mistake:
+        cli.fail(str(mistake))
+
+
+if __name__ == "__main__":
+    sys.exit(main())
