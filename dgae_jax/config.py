@@ -48,7 +48,7 @@ class PolicyConfig:
     """PPO's clip range epsilon of the probability ratio [1]."""
     learning_rate: float = 3e-4
     """Adam's learning rate at the start [1]."""
-    learning_rate_end: float = 1.0
+    learning_rate_end: float = 0.0
     """Learning rate at the end of the run as a fraction of its start: 1 constant, 0 linear decay to zero [1]."""
     epochs: int = 10
     """Passes over each rollout [1]."""
@@ -73,7 +73,7 @@ class CriticConfig:
     """Threshold of the quantile-Huber loss of a distributional critic [units of the scaled return]."""
     learning_rate: float = 3e-4
     """Adam's learning rate at the start [1]."""
-    learning_rate_end: float = 1.0
+    learning_rate_end: float = 0.0
     """Learning rate at the end of the run as a fraction of its start: 1 constant, 0 linear decay to zero [1]."""
     epochs: int = 10
     """Passes over each rollout [1]."""

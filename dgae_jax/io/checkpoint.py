@@ -22,7 +22,7 @@ def save(directory: Path, state: TrainState, steps: int, keep: int = 3) -> Path:
     path = directory / f"steps_{steps:012d}.msgpack"
     part = path.with_suffix(".part")
     with part.open("wb") as file:
-        file.write(serialization.to_bytes(_plain(state)))
+        file.write(serialization.to_bytes(jax.device_get(_plain(state))))
         file.flush()
         os.fsync(file.fileno())
     part.replace(path)
@@ -42,7 +42,7 @@ def latest(run_dir: Path) -> Path:
 def load(path: Path, config: Config) -> TrainState:
     """The state saved at `path` by a run of `config`; raises CheckpointError if it is damaged or does not fit."""
     blank = jax.eval_shape(make_trainer(make_task(config), 1).init, config, seed_keys(config))
-    template = _plain(jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), blank, is_leaf=_is_key))
+    template = jax.tree.map(lambda x: np.zeros(x.shape, x.dtype), jax.eval_shape(_plain, blank))
     try:
         loaded = serialization.from_bytes(template, path.read_bytes())
     except OSError as reason:
@@ -52,7 +52,7 @@ def load(path: Path, config: Config) -> TrainState:
     for (where, want), got in zip(jax.tree.leaves_with_path(template), jax.tree.leaves(loaded), strict=True):
         if np.shape(got) != want.shape or np.asarray(got).dtype != want.dtype:
             raise CheckpointError(f"{path}: {jax.tree_util.keystr(where)} is {np.shape(got)}, this run's is {want.shape}")
-    return jax.tree.map(lambda x, like: jax.random.wrap_key_data(x) if _is_key(like) else jnp.asarray(x), loaded, blank)
+    return jax.tree.map(lambda like, x: jax.random.wrap_key_data(x) if _is_key(like) else jnp.asarray(x), blank, loaded)
 
 
 def _is_key(x) -> bool:
@@ -60,4 +60,5 @@ def _is_key(x) -> bool:
 
 
 def _plain(state: TrainState) -> TrainState:
-    return jax.tree.map(lambda x: np.asarray(jax.random.key_data(x) if _is_key(x) else x), state)
+    """The state with its keys as the numbers they are made of."""
+    return jax.tree.map(lambda x: jax.random.key_data(x) if _is_key(x) else x, state)
