@@ -1,0 +1,18 @@
+"""Shapes and dtypes in annotations are checked while tests run; compiled programs are kept between runs."""
+
+import os
+import tempfile
+
+import jaxtyping
+
+jaxtyping.install_import_hook("dgae_jax", "beartype.beartype")
+
+import jax  # noqa: E402
+import pytest  # noqa: E402
+
+jax.config.update("jax_compilation_cache_dir", os.path.join(tempfile.gettempdir(), "dgae_jax_tests"))  # noqa: PTH118
+
+
+@pytest.fixture
+def key():
+    return jax.random.key(0)
