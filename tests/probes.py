@@ -1,0 +1,56 @@
+"""Small environments with known values, for tests."""
+
+import jax
+import jax.numpy as jnp
+from brax.envs.base import Env, State
+
+
+class Counter(Env):
+    """Counts its steps; the reward is the count, and an episode terminates after `length` steps.
+
+    Each episode starts from a random fraction, so that two resets differ.
+    """
+
+    observation_size, action_size, backend = 2, 1, "none"
+    action_range = (jnp.array([-1.0]), jnp.array([1.0]))
+
+    def __init__(self, length: int = 10**9):
+        self.length = length
+
+    def reset(self, rng):
+        obs = jnp.stack([jnp.zeros(()), jax.random.uniform(rng)])
+        zero = jnp.zeros(())
+        return State(zero, obs, zero, zero, {"action": zero})
+
+    def step(self, state, action):
+        count = state.obs[0] + 1
+        done = (count >= self.length).astype(jnp.float32)
+        return state.replace(obs=state.obs.at[0].set(count), reward=count, done=done, metrics={"action": action[0]})
+
+
+class Target(Env):
+    """One-step episodes: the reward is −(action − ½·side)², side = ±1 observed. The best mean action is ½·side."""
+
+    observation_size, action_size, backend = 1, 1, "none"
+    action_range = (jnp.array([-2.0]), jnp.array([2.0]))
+
+    def reset(self, rng):
+        zero = jnp.zeros(())
+        return State(zero, jax.random.rademacher(rng, (1,), jnp.float32), zero, zero)
+
+    def step(self, state, action):
+        return state.replace(reward=-((action[0] - 0.5 * state.obs[0]) ** 2), done=jnp.ones(()))
+
+
+class Constant(Env):
+    """Reward 1 at every step, for ever: the value is 1 / (1 − γ) everywhere."""
+
+    observation_size, action_size, backend = 1, 1, "none"
+    action_range = (jnp.array([-1.0]), jnp.array([1.0]))
+
+    def reset(self, rng):
+        zero = jnp.zeros(())
+        return State(zero, jnp.ones(1), zero, zero)
+
+    def step(self, state, action):
+        return state.replace(reward=jnp.ones(()))
