@@ -4,7 +4,7 @@ from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import jax
-from jaxtyping import Array, Float
+from jaxtyping import Array, ArrayLike, Float
 
 from dgae_jax.networks import value_network
 from dgae_jax.returns import bellman_target, lambda_return, lambda_shift_target, sr_lambda_target
@@ -62,7 +62,7 @@ def scalar(obs_size: int, *, hidden: Sequence[int], target: str) -> Critic:
     return _critic(obs_size, 1, hidden, target, distance)
 
 
-def quantile(obs_size: int, *, hidden: Sequence[int], target: str, quantiles: int, kappa: float) -> Critic:
+def quantile(obs_size: int, *, hidden: Sequence[int], target: str, quantiles: int, kappa: ArrayLike) -> Critic:
     """F⁻¹ of the return at K midpoints, fitted by the quantile-Huber loss (Eq. quantile_huber_loss)."""
 
     def distance(quantiles: Float[Array, "B K"], target: Float[Array, "B J"]) -> Float[Array, " B"]:

@@ -5,11 +5,11 @@ actions are noise around zero (Andrychowicz et al. 2021).
 """
 
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import flax.linen as nn
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, ArrayLike, Float
 
 from dgae_jax.gaussian import Gaussian
 from dgae_jax.types import Policy
@@ -22,7 +22,7 @@ class Network(NamedTuple):
     apply: Callable
 
 
-def _dense(width: int, scale: float, bias: Any = 0.0) -> nn.Dense:
+def _dense(width: int, scale: float, bias: ArrayLike = 0.0) -> nn.Dense:
     return nn.Dense(width, kernel_init=nn.initializers.orthogonal(scale), bias_init=nn.initializers.constant(bias))
 
 
@@ -54,7 +54,7 @@ class SharedCovariance(nn.Module):
 
     hidden: Sequence[int]
     actions: int
-    initial_std: Any
+    initial_std: ArrayLike
 
     @nn.compact
     def __call__(self, obs: Float[Array, "*batch O"]) -> Gaussian:
@@ -68,7 +68,7 @@ class StateCovariance(nn.Module):
 
     hidden: Sequence[int]
     actions: int
-    initial_std: Any
+    initial_std: ArrayLike
 
     @nn.compact
     def __call__(self, obs: Float[Array, "*batch O"]) -> Gaussian:
@@ -81,7 +81,7 @@ class StateCovariance(nn.Module):
 COVARIANCES = {"shared": SharedCovariance, "state": StateCovariance}
 
 
-def gaussian_policy(obs_size: int, action_size: int, *, hidden: Sequence[int], covariance: str, initial_std: float) -> Policy:
+def gaussian_policy(obs_size: int, action_size: int, *, hidden: Sequence[int], covariance: str, initial_std: ArrayLike) -> Policy:
     """A Gaussian policy with mean and diagonal covariance (Sec. results, set-up)."""
     module = COVARIANCES[covariance](tuple(hidden), action_size, initial_std)
     return Policy(lambda key: module.init(key, jnp.zeros(obs_size)), module.apply)

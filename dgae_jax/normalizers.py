@@ -5,7 +5,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 from brax.training.acme import running_statistics
-from jaxtyping import Array, Float
+from jaxtyping import Array, ArrayLike, Float
 
 OBSERVATION_LIMIT = 10.0
 """Normalised observations are clipped to ±10 deviations."""
@@ -42,7 +42,7 @@ def return_scale(num_envs: int) -> ReturnScale:
 
 
 def rescale(
-    scale: ReturnScale, reward: Float[Array, "T N"], done: Float[Array, "T N"], gamma: Any
+    scale: ReturnScale, reward: Float[Array, "T N"], done: Float[Array, "T N"], gamma: ArrayLike
 ) -> tuple[ReturnScale, Float[Array, "T N"]]:
     """Follow the discounted returns through a rollout, then divide its rewards by their deviation.
 

@@ -1,12 +1,11 @@
 """One training iteration as one pure function: roll out, estimate advantages, improve the policy, fit the critic."""
 
 from collections.abc import Callable
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 from brax.envs.base import Env
-from jaxtyping import Array, Key
+from jaxtyping import Array, ArrayLike, Key
 
 from dgae_jax import gaussian, normalizers
 from dgae_jax.returns import decay, lambda_sum
@@ -24,8 +23,8 @@ def make_train(
     num_envs: int,
     horizon: int,
     episode_length: int,
-    gamma: Any,
-    lam: Any,
+    gamma: ArrayLike,
+    lam: ArrayLike,
     normalize_observations: bool,
     normalize_rewards: bool,
 ) -> tuple[Callable[[Array], TrainState], Callable[[TrainState], tuple[TrainState, Metrics]]]:

@@ -14,7 +14,7 @@ Loss = Callable[[Params, Batch], tuple[jax.Array, dict[str, jax.Array]]]
 """`loss(params, batch) -> (scalar, info)`; info holds scalars worth logging."""
 
 
-def surrogate(policy: Policy, clip: float | jax.Array = jnp.inf) -> Loss:
+def surrogate(policy: Policy, clip: ArrayLike = jnp.inf) -> Loss:
     """−E[min(ρA, clip(ρ, 1 ± ε)A)], ρ = π(a|s)/π_old(a|s) (Schulman et al. 2017); without a clip, plain ρA.
 
     At the policy that acted its gradient is that of −E[A log π] (Eq. gradient_obj_fcn).
@@ -24,7 +24,7 @@ def surrogate(policy: Policy, clip: float | jax.Array = jnp.inf) -> Loss:
         distribution = policy.apply(params, batch.obs)
         log_ratio = gaussian.log_prob(distribution, batch.action) - batch.log_prob
         ratio = jnp.exp(log_ratio)
-        clipped = jnp.clip(ratio, 1 - clip, 1 + clip)
+        clipped = jnp.clip(ratio, jnp.subtract(1, clip), jnp.add(1, clip))
         gain = jnp.minimum(ratio * batch.advantage, clipped * batch.advantage)
         info = {
             "kl": (ratio - 1 - log_ratio).mean(),

@@ -5,7 +5,21 @@ import tempfile
 
 import jaxtyping
 
-jaxtyping.install_import_hook("dgae_jax", "beartype.beartype")
+ARRAYS = [
+    "transport",
+    "returns",
+    "gaussian",
+    "statistics",
+    "networks",
+    "physics",
+    "critics",
+    "updates",
+    "normalizers",
+    "envs",
+    "rollout",
+    "train",
+]
+jaxtyping.install_import_hook([f"dgae_jax.{module}" for module in ARRAYS], "beartype.beartype")
 
 import jax  # noqa: E402
 import pytest  # noqa: E402

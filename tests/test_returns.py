@@ -140,13 +140,13 @@ def test_lambda_shift_has_the_lambda_returns_mean_and_the_one_step_targets_shape
 
 
 def test_sample_replacement_with_lambda_zero_is_the_bellman_target(key):
-    reward, z, z_next, terminated, truncated = trajectory(key)
+    reward, _, z_next, terminated, truncated = trajectory(key)
     d = decay(terminated, truncated, gamma=GAMMA, lam=0.0)
     assert_allclose(dg.sr_lambda_target(key, reward, *d, z_next), dg.bellman_target(reward, d.discount, z_next), atol=1e-6)
 
 
 def test_sample_replacement_with_lambda_one_is_the_return_to_the_end_of_the_trace(key):
-    reward, z, z_next, terminated, truncated = trajectory(key)
+    reward, _, z_next, terminated, truncated = trajectory(key)
     d = decay(terminated, truncated, gamma=GAMMA, lam=1.0)
     got, later = dg.sr_lambda_target(key, reward, *d, z_next), np.asarray(z_next[-1])
     for t in reversed(range(12)):
