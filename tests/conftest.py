@@ -5,21 +5,10 @@ import tempfile
 
 import jaxtyping
 
-ARRAYS = [
-    "transport",
-    "returns",
-    "gaussian",
-    "statistics",
-    "networks",
-    "physics",
-    "critics",
-    "updates",
-    "normalizers",
-    "envs",
-    "rollout",
-    "train",
-]
-jaxtyping.install_import_hook([f"dgae_jax.{module}" for module in ARRAYS], "beartype.beartype")
+ARRAYS = """
+    transport returns gaussian statistics networks physics critics updates normalizers envs rollout train
+"""
+jaxtyping.install_import_hook([f"dgae_jax.{module}" for module in ARRAYS.split()], "beartype.beartype")
 
 import jax  # noqa: E402
 import pytest  # noqa: E402

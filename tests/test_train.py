@@ -96,7 +96,9 @@ def test_floats_of_the_configuration_may_be_swept_in_one_program():
         init, step = dg.make_train(dg.make_algorithm("ppo", env, config), env, config)
         state = init(jax.random.key(0))
         after, _ = step(state)
-        return sum(jnp.abs(a - b).sum() for a, b in zip(jax.tree.leaves(after.policy), jax.tree.leaves(state.policy), strict=True))
+        return sum(
+            jnp.abs(a - b).sum() for a, b in zip(jax.tree.leaves(after.policy.params), jax.tree.leaves(state.policy.params), strict=True)
+        )
 
     slow, fast = moved(rates)
     assert 10 * slow < fast

@@ -1,0 +1,143 @@
+import dataclasses
+import json
+import math
+
+import chex
+import jax
+import numpy as np
+import pytest
+from matplotlib.image import imread
+
+import dgae_jax as dg
+from dgae_jax.build import make_task, make_trainer, seed_keys
+from dgae_jax.config import ConfigError
+from dgae_jax.io import checkpoint, metrics, plots, run_directory
+from dgae_jax.io.checkpoint import CheckpointError
+from dgae_jax.io.evaluation import evaluate_state
+from tests.test_train import SMALL
+
+
+@pytest.fixture(scope="module")
+def state():
+    return make_trainer(make_task(SMALL), 1).init(SMALL, seed_keys(SMALL))
+
+
+def plain(state):
+    return jax.device_get(state._replace(key=jax.random.key_data(state.key)))
+
+
+def test_a_checkpoint_gives_the_state_back_bit_for_bit(state, tmp_path):
+    loaded = checkpoint.load(checkpoint.save(tmp_path, state, 64), SMALL)
+    chex.assert_trees_all_equal(plain(loaded), plain(state))
+    chex.assert_trees_all_equal_shapes_and_dtypes(loaded, state)
+
+
+def test_only_the_newest_checkpoints_are_kept(state, tmp_path):
+    (tmp_path / "checkpoints").mkdir()
+    for steps in (64, 9_000, 128, 10_000):
+        checkpoint.save(tmp_path / "checkpoints", state, steps, keep=2)
+    assert sorted(p.name for p in (tmp_path / "checkpoints").iterdir()) == ["steps_000000009000.msgpack", "steps_000000010000.msgpack"]
+    assert checkpoint.latest(tmp_path).name == "steps_000000010000.msgpack"
+
+
+@pytest.mark.parametrize(
+    ("damage", "reason"),
+    [
+        (lambda b: b[:100], "is damaged"),
+        (lambda b: b"", "is damaged"),
+        (lambda b: b"\x00" * 50, "is damaged"),
+        (lambda b: b.replace(b"critic", b"cretic"), "is damaged or of another run"),
+    ],
+)
+def test_a_damaged_checkpoint_is_refused_by_name(damage, reason, state, tmp_path):
+    path = checkpoint.save(tmp_path, state, 64)
+    path.write_bytes(damage(path.read_bytes()))
+    with pytest.raises(CheckpointError, match=f"{path.name}: {reason}"):
+        checkpoint.load(path, SMALL)
+
+
+def test_a_checkpoint_of_another_network_size_is_refused_by_leaf_and_shapes(state, tmp_path):
+    path = checkpoint.save(tmp_path, state, 64)
+    wider = dataclasses.replace(SMALL, policy=dataclasses.replace(SMALL.policy, hidden=(9,)))
+    with pytest.raises(CheckpointError, match=r"policy.* is \(1, 8, 3\), this run's is \(1, 9, 3\)"):
+        checkpoint.load(path, wider)
+
+
+def test_a_directory_without_checkpoints_is_refused(tmp_path):
+    with pytest.raises(CheckpointError, match="must hold a checkpoint"):
+        checkpoint.latest(tmp_path)
+
+
+def test_metrics_are_one_json_object_per_run_and_iteration(tmp_path):
+    file = metrics.MetricsFile(tmp_path / "metrics.jsonl", first_seed=7, samples=100)
+    columns = {"episode_return": np.array([[1.5, np.nan], [2.0, 3.0], [0, 0]]), "episodes": np.array([[0, 1], [2, 3], [0, 0]])}
+    file.append(columns, 2, 1.0)
+    file.append(columns, 1, 2.0)
+    rows = metrics.read(tmp_path / "metrics.jsonl")
+    assert [(r["iteration"], r["steps"], r["seed"], r["episode_return"], r["episodes"]) for r in rows] == [
+        (1, 100, 7, 1.5, 0), (1, 100, 8, None, 1), (2, 200, 7, 2, 2), (2, 200, 8, 3, 3), (3, 300, 7, 1.5, 0), (3, 300, 8, None, 1),
+    ]  # fmt: skip
+    assert "NaN" not in (tmp_path / "metrics.jsonl").read_text()
+
+
+@pytest.mark.parametrize("seeds", [1, 3])
+def test_the_learning_curve_is_drawn_with_and_without_returns(seeds, tmp_path):
+    rows = [{"steps": 10 * i, "seed": s, "episode_return": None if i < 3 else math.log(i + s)} for i in range(1, 20) for s in range(seeds)]
+    plots.save(plots.learning_curve(rows, "title"), tmp_path / "curve.png")
+    image = imread(tmp_path / "curve.png")
+    assert image.shape[0] > 300
+    assert image[..., :3].min() < 0.5
+    plots.save(plots.learning_curve(rows[:seeds], "title"), tmp_path / "none.png")
+    assert [p.name for p in sorted(tmp_path.iterdir())] == ["curve.png", "none.png"]
+
+
+def test_a_run_directory_says_what_the_run_is(tmp_path):
+    run_directory.create(tmp_path / "a" / "b", SMALL)
+    assert run_directory.read_config(tmp_path / "a" / "b") == SMALL
+    manifest = json.loads((tmp_path / "a" / "b" / "manifest.json").read_text())
+    assert manifest["versions"]["jax"] == jax.__version__
+    assert {"command", "git_revision", "device", "python", "started"} <= set(manifest)
+
+
+def test_a_used_or_unwritable_run_directory_is_refused_and_left_alone(tmp_path):
+    (tmp_path / "note.txt").write_text("mine")
+    with pytest.raises(ConfigError, match=r"--run-dir .*: must be a new or empty directory"):
+        run_directory.create(tmp_path, SMALL)
+    assert [p.name for p in tmp_path.iterdir()] == ["note.txt"]
+    with pytest.raises(ConfigError, match=r"--run-dir .*: must be a directory that can be written"):
+        run_directory.create(tmp_path / "note.txt" / "below", SMALL)
+    with pytest.raises(ConfigError, match=r"--run-dir .*: must be a new or empty directory"):
+        run_directory.create(tmp_path / "note.txt", SMALL)
+
+
+def test_an_empty_run_directory_is_welcome(tmp_path):
+    run_directory.create(tmp_path, SMALL)
+    assert (tmp_path / "checkpoints").is_dir()
+
+
+@pytest.mark.parametrize("text", ["", "[]", "{", '{"env": "hopper"}'])
+def test_a_config_file_that_is_none_is_refused(text, tmp_path):
+    (tmp_path / "config.json").write_text(text)
+    with pytest.raises(ConfigError, match=r"config\.json"):
+        run_directory.read_config(tmp_path)
+
+
+@pytest.mark.parametrize("engine", ["gymnasium", "native"])
+def test_an_untrained_policy_falls_at_once_in_every_engine_and_each_seed_is_reported(engine):
+    config = dataclasses.replace(SMALL, num_seeds=2, seed=3)
+    state = make_trainer(dg.make_env("hopper", physics="native"), 1).init(config, seed_keys(config))
+    result = evaluate_state(state, config, engine=engine, episodes=5)
+    assert result["episodes"] == len(result["returns"]) == 10
+    assert [s["seed"] for s in result["seeds"]] == [3, 4]
+    assert result["returns"] == result["seeds"][0]["returns"] + result["seeds"][1]["returns"]
+    assert result["return_mean"] == pytest.approx(np.mean(result["returns"]), rel=1e-4)
+    assert result["return_std"] == pytest.approx(np.std(result["returns"]), rel=1e-3)
+    assert 0 < result["return_mean"] < 300
+
+
+def test_native_and_gymnasium_give_the_same_policy_the_same_return():
+    config = dataclasses.replace(SMALL, seed=1)
+    state = make_trainer(dg.make_env("hopper", physics="native"), 1).init(config, seed_keys(config))
+    ours, theirs = (evaluate_state(state, config, engine=engine, episodes=40) for engine in ("native", "gymnasium"))
+    error = (ours["return_std"] ** 2 + theirs["return_std"] ** 2) ** 0.5 / 40**0.5
+    assert abs(ours["return_mean"] - theirs["return_mean"]) < 4 * error
