@@ -14,6 +14,7 @@ import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
+import gymnasium
 import jax
 
 from dgae_jax import Config
@@ -76,7 +77,12 @@ def peer(worlds: int, processes: bool, threads: int, seconds: float) -> Row:
             return len(self.ends) < 3 or self.ends[-1] - self.ends[1] < seconds
 
     torch.set_num_threads(threads)
-    vector = make_vec_env("Hopper-v4", worlds, vec_env_cls=SubprocVecEnv if processes else DummyVecEnv)
+
+    def world() -> gymnasium.Env:
+        gymnasium.logger.min_level = gymnasium.logger.ERROR  # that v4 is not the newest version is known
+        return gymnasium.make("Hopper-v4")
+
+    vector = make_vec_env(world, worlds, vec_env_cls=SubprocVecEnv if processes else DummyVecEnv)
     env, clock = VecNormalize(vector), Clock()
     clock.ends = []
     model = PPO(

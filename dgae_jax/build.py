@@ -97,11 +97,11 @@ def make_trainer(env: Env, capacity: int) -> Trainer:
 
     @jax.jit
     def init(config: Config, keys: jax.Array) -> TrainState:
-        return jax.vmap(parts(config)[0])(keys)
+        return _over_runs(parts(config)[0])(keys)
 
     @partial(jax.jit, donate_argnums=1)
     def dispatch(config: Config, state: TrainState, count: int):
-        step = jax.jit(jax.vmap(parts(config)[1]))  # jitted, so that asking for its shapes does not trace it twice
+        step = jax.jit(_over_runs(parts(config)[1]))  # jitted, so that asking for its shapes does not trace it twice
         rows = jax.tree.map(lambda x: jnp.zeros((capacity, *x.shape), x.dtype), jax.eval_shape(step, state)[1])
 
         def iteration(i, carry):
@@ -112,6 +112,20 @@ def make_trainer(env: Env, capacity: int) -> Trainer:
         return jax.lax.fori_loop(0, count, iteration, (state, rows))
 
     return Trainer(init, dispatch)
+
+
+def _over_runs(f: Callable) -> Callable:
+    """`f` mapped over the leading axis of its argument.
+
+    An axis of one is taken off and put back: XLA's CPU code for arrays with a leading 1 is several times slower.
+    """
+
+    def mapped(tree):
+        if jax.tree.leaves(tree)[0].shape[0] > 1:
+            return jax.vmap(f)(tree)
+        return jax.tree.map(lambda x: jnp.expand_dims(x, 0), f(jax.tree.map(lambda x: x[0], tree)))
+
+    return mapped
 
 
 def seed_keys(config: Config) -> jax.Array:
