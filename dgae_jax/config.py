@@ -42,7 +42,7 @@ class PolicyConfig:
     """Width of each hidden layer [units]."""
     covariance: str = "shared"
     """Where the actions' deviation comes from: shared (one learned vector) or state (an output of the network)."""
-    initial_std: float = 1.0
+    initial_std: float = 0.5
     """Deviation of the first actions [units of the action]."""
     clip: float = 0.2
     """PPO's clip range epsilon of the probability ratio [1]."""
