@@ -9,11 +9,12 @@ import math
 from dataclasses import dataclass, field, fields
 from typing import Any
 
+import brax.envs
 import jax
 
 from dgae_jax.algorithms import TABLE
 from dgae_jax.critics import TARGETS
-from dgae_jax.envs.registry import PHYSICS, TASKS, VERSIONS
+from dgae_jax.envs.registry import BRAX, PHYSICS, TASKS, VERSIONS
 from dgae_jax.networks import COVARIANCES
 
 LARGEST_BUDGET = 2**31 - 1
@@ -89,9 +90,9 @@ class Config:
     """One training run."""
 
     env: str = "hopper"
-    """Task: hopper."""
+    """Task: ant, hopper, swimmer, walker2d, or brax:NAME for one of Brax's own."""
     env_version: str = "v4"
-    """Gymnasium version whose semantics the task has: v4 (the same as Gym's v3)."""
+    """Gymnasium version whose semantics the task has: v4 (the same as Gym's v3) or v5."""
     algo: str = "dppo"
     """Algorithm: ppo or dppo."""
     physics: str = "mjx"
@@ -159,10 +160,13 @@ def _above_zero(path: str, value: float) -> None:
 
 def validate(config: Config) -> None:
     """Raise `ConfigError` for the first setting that cannot be, alone or together with the others."""
-    _choice("env", config.env, TASKS)
+    if not config.env.startswith(BRAX):
+        _check("env", config.env, config.env in TASKS, f"one of {', '.join(TASKS)}, or {BRAX}NAME")
     _choice("env_version", config.env_version, VERSIONS)
     _choice("algo", config.algo, TABLE)
     _choice("physics", config.physics, PHYSICS)
+    if config.env.startswith(BRAX):
+        _validate_brax(config)
     _between("seed", config.seed, 0, 2**32 - 1)
     for name in ("num_seeds", "total_steps", "num_envs", "horizon", "episode_length"):
         _positive(name, getattr(config, name))
@@ -182,6 +186,16 @@ def validate(config: Config) -> None:
         _check(f"critic.{name}", value, value == _CRITIC_OPTIONS[name], f"left out: {config.algo} does not use it")
     if config.iterations < 1:
         _check("total_steps", config.total_steps, False, f"at least one iteration of num_envs * horizon = {config.samples:,} samples")
+
+
+def _validate_brax(config: Config) -> None:
+    name = config.env.removeprefix(BRAX)
+    try:
+        brax.envs.get_environment(name)
+    except KeyError:
+        _check("env", config.env, False, f"one of {', '.join(TASKS)}, or {BRAX}NAME with a name that brax.envs knows")
+    _check("physics", config.physics, config.physics == "mjx", f"mjx with an environment of Brax's own ({config.env})")
+    _check("env_version", config.env_version, config.env_version == Config.env_version, "left out with an environment of Brax's own")
 
 
 def _validate_fit(config: Config, part: str) -> None:

@@ -83,6 +83,7 @@ def make_train(
             "episode_return": jnp.nanmean(episodes.last_total),
             "episode_length": jnp.nanmean(episodes.last_steps),
             "episodes": (step.terminated | step.truncated).sum(),
+            "nonfinite": episodes.nonfinite - state.episodes.nonfinite,
             "reward": step.reward.mean(),
             **{f"policy/{name}": value for name, value in improved.items()},
             **{f"critic/{name}": value for name, value in evaluated.items()},

@@ -28,6 +28,23 @@ class Counter(Env):
         return state.replace(obs=state.obs.at[0].set(count), reward=count, done=done, metrics={"action": action[0]})
 
 
+class Fragile(Counter):
+    """A counter in which, at its third step, what `where` names turns to `value` if the fraction it started from is below ½."""
+
+    def __init__(self, where: str, value: float):
+        super().__init__()
+        self.where, self.value = where, value
+
+    def step(self, state, action):
+        after = super().step(state, action)
+        breaks = (after.obs[0] == 3) & (after.obs[1] < 0.5)
+        if self.where == "state":
+            return after.replace(pipeline_state=jnp.where(breaks, self.value, after.pipeline_state))
+        if self.where == "reward":
+            return after.replace(reward=jnp.where(breaks, self.value, after.reward))
+        return after.replace(obs=jnp.where(breaks, self.value, after.obs))
+
+
 class Target(Env):
     """One-step episodes: the reward is −(action − ½·side)², side = ±1 observed. The best mean action is ½·side."""
 

@@ -22,8 +22,8 @@ def test_the_default_configuration_is_valid():
 @pytest.mark.parametrize(
     ("path", "value", "allowed"),
     [
-        ("env", "hoper", "one of hopper"),
-        ("env_version", "v9", "one of v4"),
+        ("env", "hoper", "one of ant, hopper, swimmer, walker2d"),
+        ("env_version", "v9", "one of v4, v5"),
         ("algo", "sac", "one of ppo, dppo"),
         ("physics", "bullet", "one of mjx, native"),
         ("seed", -1, "from 0 to"),

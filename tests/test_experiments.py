@@ -123,7 +123,7 @@ def test_evaluating_twice_gives_the_same_returns(trained, run, tmp_path):
         (["--num-envs", "many"], r"--num-envs: invalid literal for int\(\) with base 10: 'many'"),
         (["--num-envs"], r"--num-envs"),
         (["--num-envs", "0"], r"--num-envs 0: must be a whole number of at least 1"),
-        (["--env", "hoper"], r"--env hoper: must be one of hopper"),
+        (["--env", "hoper"], r"--env hoper: must be one of ant, hopper, swimmer, walker2d"),
         (["--algo", "sac"], r"--algo sac: must be one of ppo, dppo"),
         (["--gamma", "1.5"], r"--gamma 1.5: must be a number from 0 to 1"),
         (["--lam", "-1"], r"--lam -1.0: must be a number from 0 to 1"),

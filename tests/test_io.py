@@ -14,6 +14,7 @@ from dgae_jax.config import ConfigError
 from dgae_jax.io import checkpoint, metrics, plots, run_directory
 from dgae_jax.io.checkpoint import CheckpointError
 from dgae_jax.io.evaluation import evaluate_state
+from dgae_jax.io.training import _save_incidents
 from tests.test_train import SMALL
 
 
@@ -46,7 +47,7 @@ def test_only_the_newest_checkpoints_are_kept(state, tmp_path):
         (lambda b: b[:100], "is damaged"),
         (lambda b: b"", "is damaged"),
         (lambda b: b"\x00" * 50, "is damaged"),
-        (lambda b: b.replace(b"critic", b"cretic"), "is damaged or of another run"),
+        (lambda b: b.replace(b"critic", b"cretic"), "is of another run, cretic.* is unknown here"),
     ],
 )
 def test_a_damaged_checkpoint_is_refused_by_name(damage, reason, state, tmp_path):
@@ -59,7 +60,7 @@ def test_a_damaged_checkpoint_is_refused_by_name(damage, reason, state, tmp_path
 def test_a_checkpoint_of_another_network_size_is_refused_by_leaf_and_shapes(state, tmp_path):
     path = checkpoint.save(tmp_path, state, 64)
     wider = dataclasses.replace(SMALL, policy=dataclasses.replace(SMALL.policy, hidden=(9,)))
-    with pytest.raises(CheckpointError, match=r"policy.* is \(1, 8, 3\), this run's is \(1, 9, 3\)"):
+    with pytest.raises(CheckpointError, match=r"is of another run, policy\..* is \(1, 8, 3\), here \(1, 9, 3\)"):
         checkpoint.load(path, wider)
 
 
@@ -89,6 +90,22 @@ def test_the_learning_curve_is_drawn_with_and_without_returns(seeds, tmp_path):
     assert image[..., :3].min() < 0.5
     plots.save(plots.learning_curve(rows[:seeds], "title"), tmp_path / "none.png")
     assert [p.name for p in sorted(tmp_path.iterdir())] == ["curve.png", "none.png"]
+
+
+def test_an_incident_can_be_replayed_from_its_file(state, tmp_path):
+    qpos, *rest = state.episodes.incident[0]
+    broken = state._replace(
+        episodes=state.episodes._replace(
+            incident=(type(state.episodes.incident[0])(qpos.at[0, 2].set(9), *rest), state.episodes.incident[1] + 0.5)
+        )
+    )
+    _save_incidents(broken, [{"seed": 0, "steps": 64, "nonfinite": 0}, {"seed": 0, "steps": 128, "nonfinite": 2}], tmp_path / "nonfinite")
+    saved = np.load(tmp_path / "nonfinite" / "steps_000000000128_seed_0.npz")
+    assert set(saved) == {"qpos", "qvel", "warmstart", "torso", "contact", "action"}
+    env = make_task(SMALL)
+    replayed = env.set_state(env.reset(jax.random.key(0)), saved["qpos"], saved["qvel"])
+    assert float(replayed.pipeline_state.qpos[2]) == 9
+    np.testing.assert_array_equal(saved["action"], 0.5)
 
 
 def test_a_run_directory_says_what_the_run_is(tmp_path):

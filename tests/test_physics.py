@@ -8,102 +8,141 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
-from dgae_jax.envs.gym_tasks import load_model
-from dgae_jax.physics.base import at_pose
+from dgae_jax.envs.registry import TASKS
+from dgae_jax.envs.task import load_spec
+from dgae_jax.physics.base import PhysicsState, has_free_root
 from dgae_jax.physics.mjx import mjx
 from dgae_jax.physics.native import native
 
-FRAME_SKIP = 4
+MODELS = sorted(TASKS)
+COUNT = 128
+
+
+def model_of(name):
+    return load_spec(TASKS[name].FILE["v4"]).compile()
 
 
 @functools.cache
-def states(count=128):
-    """Hopper poses visited under random controls, fallen ones included, in float32, with a control for each."""
-    model, rng = load_model("hopper.xml"), np.random.default_rng(0)
+def states(name):
+    """Poses under random and held controls from random starts, fallen ones included, in float32, with a control for each."""
+    model, rng = model_of(name), np.random.default_rng(0)
     data, kept = mujoco.MjData(model), []
-    while len(kept) < count:
-        if len(kept) % 16 == 0:
+    while len(kept) < COUNT:
+        if len(kept) % 32 == 0:
             mujoco.mj_resetData(model, data)
             data.qpos[:] += rng.uniform(-0.2, 0.2, model.nq)
             data.qvel[:] += rng.uniform(-1, 1, model.nv)
-        ctrl = rng.uniform(-1.2, 1.2, model.nu).astype(np.float32)
-        kept.append((data.qpos.astype(np.float32), data.qvel.astype(np.float32), data.qacc_warmstart.astype(np.float32), ctrl))
+            held = rng.uniform(-1.2, 1.2, model.nu)
+        ctrl = (held if len(kept) % 64 < 32 else rng.uniform(-1.2, 1.2, model.nu)).astype(np.float32)
+        kept.append((*(x.astype(np.float32) for x in (data.qpos, data.qvel, data.qacc_warmstart)), ctrl))
         data.ctrl[:] = ctrl
-        mujoco.mj_step(model, data, nstep=FRAME_SKIP)
-    return tuple(jnp.asarray(np.stack(x)) for x in zip(*kept, strict=True))
+        mujoco.mj_step(model, data, nstep=TASKS[name].FRAME_SKIP)
+    return tuple(np.stack(x) for x in zip(*kept, strict=True))
 
 
 @functools.cache
-def reference():
-    """The same control interval by `mj_step` on a single `mjData`."""
-    model = load_model("hopper.xml")
-    data, after = mujoco.MjData(model), []
-    for qpos, qvel, warmstart, ctrl in zip(*map(np.asarray, states()), strict=True):
+def reference(name):
+    """The same control interval by `mj_step` on a single `mjData`, read as Gymnasium reads it."""
+    model = model_of(name)
+    data, after, contacts = mujoco.MjData(model), [], []
+    for qpos, qvel, warmstart, ctrl in zip(*states(name), strict=True):
         data.qpos[:], data.qvel[:], data.qacc_warmstart[:], data.ctrl[:] = qpos, qvel, warmstart, ctrl
-        mujoco.mj_step(model, data, nstep=FRAME_SKIP)
-        after.append((data.qpos.astype(np.float32), data.qvel.astype(np.float32), data.qacc_warmstart.astype(np.float32)))
-    return tuple(np.stack(x) for x in zip(*after, strict=True))
+        mujoco.mj_step(model, data, nstep=TASKS[name].FRAME_SKIP)
+        mujoco.mj_rnePostConstraint(model, data)
+        torso = data.xpos[1] if has_free_root(model) else data.xpos[1, :0]
+        after.append([x.copy() for x in (data.qpos, data.qvel, data.qacc_warmstart, torso, data.cfrc_ext)])
+        contacts.append(data.ncon)
+    return PhysicsState(*(np.stack(x).astype(np.float32) for x in zip(*after, strict=True))), np.array(contacts)
 
 
-def stepped(physics):
-    qpos, qvel, warmstart, ctrl = states()
-    state = at_pose(qpos, qvel)._replace(warmstart=warmstart)
+@functools.cache
+def stepped(name, engine):
+    physics = engine(load_spec(TASKS[name].FILE["v4"]), TASKS[name].FRAME_SKIP, contact_forces=True, max_contacts=TASKS[name].CONTACTS)
+    qpos, qvel, warmstart, ctrl = map(jnp.asarray, states(name))
+    state = physics.at_pose(qpos, qvel)._replace(warmstart=warmstart)
     return jax.jit(jax.vmap(physics.step))(state, ctrl)
 
 
-def test_native_is_mj_step_bit_for_bit():
-    got = stepped(native(load_model("hopper.xml"), FRAME_SKIP))
-    for ours, theirs in zip(got, reference(), strict=True):
-        assert_array_equal(ours, theirs)
+@pytest.mark.parametrize("name", MODELS)
+def test_native_is_mj_step_bit_for_bit(name):
+    got, want = stepped(name, native), reference(name)[0]
+    for field in PhysicsState._fields:
+        assert_array_equal(getattr(got, field), getattr(want, field), err_msg=field)
 
 
 def test_native_gives_the_same_bits_through_nested_vmaps_and_alone():
-    physics = native(load_model("hopper.xml"), FRAME_SKIP)
-    qpos, qvel, warmstart, ctrl = (x[:12].reshape(3, 4, -1) for x in states())
-    state = at_pose(qpos, qvel)._replace(warmstart=warmstart)
+    physics, want = native(load_spec("hopper.xml"), 4), reference("hopper")[0]
+    qpos, qvel, warmstart, ctrl = (jnp.asarray(x[:12]).reshape(3, 4, -1) for x in states("hopper"))
+    state = physics.at_pose(qpos, qvel)._replace(warmstart=warmstart)
     nested = jax.jit(jax.vmap(jax.vmap(physics.step)))(state, ctrl)
     alone = jax.jit(physics.step)(jax.tree.map(lambda x: x[2, 1], state), ctrl[2, 1])
-    assert_array_equal(nested.qpos.reshape(12, -1), reference()[0][:12])
+    assert_array_equal(nested.qpos.reshape(12, -1), want.qpos[:12])
     assert_array_equal(alone.qvel, nested.qvel[2, 1])
 
 
 def test_native_lets_a_non_finite_state_be_seen():
-    physics = native(load_model("hopper.xml"), FRAME_SKIP)
-    qpos, qvel, _, ctrl = (x[:2] for x in states())
-    after = jax.jit(jax.vmap(physics.step))(at_pose(qpos.at[0, 3].set(jnp.nan), qvel), ctrl)
+    physics = native(load_spec("hopper.xml"), 4)
+    qpos, qvel, _, ctrl = (jnp.asarray(x[:2]) for x in states("hopper"))
+    after = jax.jit(jax.vmap(physics.step))(physics.at_pose(qpos.at[0, 3].set(jnp.nan), qvel), ctrl)
     assert jnp.isnan(after.qpos[0]).any()
     assert jnp.isfinite(after.qpos[1]).all()
 
 
-def test_mjx_agrees_with_c_mujoco_after_a_control_interval():
-    got = stepped(mjx(load_model("hopper.xml"), FRAME_SKIP))
-    assert_allclose(got.qpos, reference()[0], atol=1e-4)
-    assert_allclose(got.qvel, reference()[1], atol=1e-3)
+@pytest.mark.parametrize("name", MODELS)
+def test_mjx_agrees_with_c_mujoco_after_a_control_interval(name):
+    got, want = stepped(name, mjx), reference(name)[0]
+    assert_allclose(got.qpos, want.qpos, atol=1e-4)
+    assert_allclose(got.qvel, want.qvel, atol=1e-3)
+    assert_allclose(got.torso, want.torso, atol=1e-4)
+    assert_allclose(got.contact, want.contact, atol=1e-2, rtol=1e-3)
 
 
-def test_states_reach_contacts_and_fallen_poses():
-    model, (qpos, *_) = load_model("hopper.xml"), states()
-    data, contacts = mujoco.MjData(model), []
-    for q in np.asarray(qpos):
-        data.qpos[:] = q
-        mujoco.mj_forward(model, data)
-        contacts.append(data.ncon)
-    assert np.mean(np.array(contacts) > 0) > 0.1
-    assert (np.abs(qpos[:, 2]) > 0.2).sum() > 10
+@pytest.mark.parametrize("name", MODELS)
+def test_the_states_reach_contacts_and_never_more_than_the_limit(name):
+    contacts, limit = reference(name)[1], TASKS[name].CONTACTS
+    if limit is None:
+        assert contacts.max() == 0
+    else:
+        assert (contacts > 0).mean() > 0.1
+        assert contacts.max() < limit
+
+
+def test_a_contact_limit_that_is_reached_would_be_seen():
+    loose, tight = (mjx(load_spec("ant.xml"), 5, max_contacts=n) for n in (8, 1))
+    qpos, qvel, _, ctrl = (jnp.asarray(x) for x in states("ant"))
+    many = reference("ant")[1] > 1
+    a, b = (jax.jit(jax.vmap(p.step))(p.at_pose(qpos[many], qvel[many]), ctrl[many]) for p in (loose, tight))
+    assert float(jnp.abs(a.qvel - b.qvel).max()) > 0.1
+
+
+def test_ant_stands_in_mjx_although_its_model_has_another_numeric():
+    physics = mjx(load_spec("ant.xml"), 5, max_contacts=8)
+    state = physics.at_pose(jnp.asarray(physics.model.qpos0), jnp.zeros(physics.model.nv))
+    state = jax.jit(lambda s: jax.lax.scan(lambda s, _: (physics.step(s, jnp.zeros(8)), None), s, None, length=100)[0])(state)
+    assert float(state.qpos[2]) > 0.3
+
+
+_BODY = "<worldbody><geom type='plane' size='1 1 1'/><body pos='0 0 1'>{}<geom size='.1'/></body></worldbody>"
 
 
 @pytest.mark.parametrize(
-    ("model", "reason"),
+    ("xml", "reason"),
     [
-        ("<mujoco><worldbody><body><freejoint/><geom size='1'/></body></worldbody><option integrator='RK4'/></mujoco>", "free or ball"),
-        ("<mujoco><worldbody><body><joint/><geom size='1'/></body></worldbody></mujoco>", "RK4"),
+        (_BODY.format("<joint/>"), "integrator mjINT_EULER"),
+        ("<option integrator='RK4'/>" + _BODY.format("<joint type='ball'/>"), "ball joints"),
+        ("<option integrator='RK4' cone='elliptic'/>" + _BODY.format("<joint/>"), "elliptic friction cones"),
+        ("<option integrator='RK4'/>" + _BODY.format("<joint frictionloss='1'/>"), "friction loss"),
+        (
+            "<option integrator='RK4'/>" + _BODY.format("<joint name='a'/>") + "<equality><joint joint1='a'/></equality>",
+            "equality constraints",
+        ),
     ],
 )
-def test_mjx_refuses_by_name_a_model_it_does_not_cover(model, reason):
-    with pytest.raises(ValueError, match=reason):
-        mjx(mujoco.MjModel.from_xml_string(model), 1)
+def test_mjx_refuses_by_name_a_model_it_does_not_cover(xml, reason):
+    with pytest.raises(ValueError, match=f"does not cover .*{reason}"):
+        mjx(mujoco.MjSpec.from_string(f"<mujoco>{xml}</mujoco>"), 1)
 
 
 def test_model_files_are_those_of_the_installed_gymnasium():
     assert find_spec("gymnasium") is not None
-    assert load_model("hopper.xml").nq == 6
+    assert load_spec("hopper.xml").compile().nq == 6

@@ -1,10 +1,11 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 from dgae_jax.rollout import evaluate, rollout, start
-from tests.probes import Counter
+from tests.probes import Counter, Fragile
 
 
 def act(key, obs):
@@ -76,3 +77,48 @@ def test_evaluation_sums_each_episode_until_its_own_end(key):
     assert_allclose(totals, [6.0] * 6)
     totals = evaluate(Counter(), lambda obs: jnp.zeros((*obs.shape[:-1], 1)), key, episodes=2, episode_length=4)
     assert_allclose(totals, [10.0] * 2)
+
+
+@pytest.mark.parametrize("value", [jnp.nan, jnp.inf])
+@pytest.mark.parametrize("where", ["state", "reward", "observation"])
+def test_a_world_that_turns_non_finite_ends_terminated_without_reward_and_starts_afresh(where, value, key):
+    episodes, step = run(Fragile(where, value), key, worlds=16, horizon=4, episode_length=100)
+    broken = np.asarray(step.obs[0, :, 1] < 0.5)
+    assert 0 < broken.sum() < 16
+    assert_array_equal(step.terminated[2], broken)
+    assert_array_equal(step.reward[2], np.where(broken, 0, 3))
+    assert_array_equal(step.obs[3, :, 0], np.where(broken, 0, 3))
+    assert_array_equal(episodes.last_total, np.where(broken, 1 + 2, np.nan))
+    assert int(episodes.nonfinite) == broken.sum()
+    assert all(np.isfinite(x).all() for x in step)
+    assert all(np.isfinite(x).all() for x in (episodes.env.obs, episodes.env.reward, episodes.total))
+
+
+def test_a_non_finite_action_is_contained_too(key):
+    def sometimes(key, obs):
+        action = jnp.where((obs[:, :1] == 2) & (obs[:, 1:] < 0.5), jnp.nan, 0.5)
+        return action, action[:, 0]
+
+    start_key, key = jax.random.split(key)
+    episodes, step = rollout(Counter(), sometimes, start(Counter(), start_key, 16), key, horizon=4, episode_length=100)
+    assert 0 < int(episodes.nonfinite) == int(step.terminated[2].sum()) < 16
+    assert all(np.isfinite(x).all() for x in step)
+    assert jnp.isnan(episodes.incident[1]).all()
+
+
+def test_a_state_broken_from_outside_reaches_no_step(key):
+    episodes = start(Counter(), key, 4)
+    broken = episodes._replace(env=episodes.env.replace(obs=episodes.env.obs.at[1].set(jnp.nan)))
+    episodes, step = rollout(Counter(), act, broken, key, horizon=3, episode_length=100)
+    assert all(np.isfinite(x).all() for x in step)
+    assert_array_equal(step.terminated[0], [False, True, False, False])
+    assert int(episodes.nonfinite) == 1
+
+
+def test_the_incident_is_the_state_before_and_the_action(key):
+    episodes, _ = run(Fragile("reward", jnp.nan), key, worlds=16, horizon=3, episode_length=100)
+    state, action = episodes.incident
+    assert_array_equal(action, 3.0)
+    assert float(state) == 0
+    healthy, _ = run(Counter(), key)
+    assert int(healthy.nonfinite) == 0

@@ -12,7 +12,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 import dgae_jax as dg
 from dgae_jax import normalizers
 from dgae_jax.build import make_greedy, make_trainer, seed_keys
-from tests.probes import Constant, Target
+from tests.probes import Constant, Fragile, Target
 
 SMALL = dg.Config(
     physics="native",
@@ -137,6 +137,16 @@ def test_the_critic_finds_the_value_of_a_constant_reward(algo, target):
     off = {"normalize_rewards": False, "normalize_observations": False}
     _, _, rows = learn(Constant(), algo, 60, gamma=0.5, episode_length=5, critic={"target": target}, **off)
     assert_allclose(rows["critic/value"][-1, 0], 2.0, atol=0.05)
+
+
+@pytest.mark.parametrize("where", ["state", "reward", "observation"])
+def test_a_world_that_turns_non_finite_is_counted_and_reaches_neither_normaliser_nor_critic_nor_policy(where):
+    _, state, rows = learn(Fragile(where, jnp.nan), "dppo", 4, episode_length=6)
+    assert (rows["nonfinite"][:, 0] > 0).all()
+    for part in (state.policy, state.critic, state.observations, state.returns):
+        assert all(np.isfinite(x).all() for x in jax.tree.leaves(part))
+    for name, column in rows.items():
+        assert np.isfinite(column).all(), name
 
 
 def test_reward_scaling_divides_by_the_deviation_of_the_discounted_return(key):

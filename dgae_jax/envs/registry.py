@@ -1,23 +1,63 @@
 """Tasks and physics by name."""
 
-from brax.envs.base import Env
+from functools import partial
 
-from dgae_jax.envs.gym_tasks import Hopper, load_model
+import brax.envs
+import jax.numpy as jnp
+from brax.envs.base import Env, Wrapper
+from jaxtyping import Array, Float
+
+from dgae_jax.envs.gym_tasks import Ant, Hopper, Swimmer, Walker2d
+from dgae_jax.envs.task import Task, load_spec
 from dgae_jax.physics.mjx import mjx
 from dgae_jax.physics.native import native
 
-TASKS = {"hopper": Hopper}
+TASKS: dict[str, type[Task]] = {"ant": Ant, "hopper": Hopper, "swimmer": Swimmer, "walker2d": Walker2d}
 PHYSICS = {"mjx": mjx, "native": native}
-VERSIONS = ("v4",)
+VERSIONS = ("v4", "v5")
+
+BRAX = "brax:"
+"""Before the name of an environment of Brax's own."""
+
+
+class BraxTask(Wrapper):
+    """An environment of Brax's own, whose actions lie in [−1, 1]."""
+
+    @property
+    def action_range(self) -> tuple[Float[Array, " A"], Float[Array, " A"]]:
+        """The lowest and highest action."""
+        return -jnp.ones(self.action_size), jnp.ones(self.action_size)
 
 
 def make_env(name: str, *, physics: str = "mjx", version: str = "v4", **task_parameters) -> Env:
     """The task `name` over the physics `physics`, with Gymnasium's semantics of `version` (v4 is Gym's v3).
 
-    `task_parameters` are those of Gymnasium's constructor. Raises ValueError, naming what exists, for an unknown name.
+    `task_parameters` are those of Gymnasium's constructor. `brax:NAME` is an environment of Brax's own, on `mjx`; its
+    parameters are those of Brax's constructor. Raises ValueError, naming what exists, for an unknown name.
     """
+    if name.startswith(BRAX):
+        return _make_brax(name.removeprefix(BRAX), physics, **task_parameters)
     for what, value, table in (("environment", name, TASKS), ("physics", physics, PHYSICS), ("version", version, VERSIONS)):
         if value not in table:
             raise ValueError(f"unknown {what} {value!r}; choose from {', '.join(table)}")
     task = TASKS[name]
-    return task(PHYSICS[physics](load_model(task.FILE), task.FRAME_SKIP), **task_parameters)
+    engine = PHYSICS[physics](
+        load_spec(task.FILE[version]),
+        task.FRAME_SKIP,
+        max_contacts=task.CONTACTS,
+        contact_forces=task.needs_contact_forces(version, **task_parameters),
+    )
+    return task(engine, version, **task_parameters)
+
+
+def _make_brax(name: str, physics: str, **parameters) -> Env:
+    if physics != "mjx":
+        raise ValueError(f"environments of Brax's own run on mjx, not on {physics}")
+    try:
+        return BraxTask(brax.envs.get_environment(name, backend="mjx", **parameters))
+    except KeyError:
+        raise ValueError(f"unknown environment {BRAX}{name}; brax.envs knows no {name!r}") from None
+
+
+for _name in TASKS:  # for Brax's own trainers: brax.envs.get_environment("dgae_hopper", physics="mjx")
+    brax.envs.register_environment(f"dgae_{_name}", partial(make_env, _name))  # pyright: ignore[reportArgumentType]

@@ -22,7 +22,7 @@ def save(directory: Path, state: TrainState, steps: int, keep: int = 3) -> Path:
     path = directory / f"steps_{steps:012d}.msgpack"
     part = path.with_suffix(".part")
     with part.open("wb") as file:
-        file.write(serialization.to_bytes(jax.device_get(_plain(state))))
+        file.write(serialization.msgpack_serialize(jax.tree.map(np.asarray, _plain(state))))
         file.flush()
         os.fsync(file.fileno())
     part.replace(path)
@@ -42,23 +42,35 @@ def latest(run_dir: Path) -> Path:
 def load(path: Path, config: Config) -> TrainState:
     """The state saved at `path` by a run of `config`; raises CheckpointError if it is damaged or does not fit."""
     blank = jax.eval_shape(make_trainer(make_task(config), 1).init, config, seed_keys(config))
-    template = jax.tree.map(lambda x: np.zeros(x.shape, x.dtype), jax.eval_shape(_plain, blank))
+    want = jax.eval_shape(_plain, blank)
     try:
-        loaded = serialization.from_bytes(template, path.read_bytes())
+        got = serialization.msgpack_restore(path.read_bytes())
+        names = set(got)
     except OSError as reason:
         raise CheckpointError(f"{path}: cannot be read ({reason.strerror})") from reason
     except Exception as reason:  # the decoder raises many kinds for damaged bytes
-        raise CheckpointError(f"{path}: is damaged or of another run ({type(reason).__name__})") from reason
-    for (where, want), got in zip(jax.tree.leaves_with_path(template), jax.tree.leaves(loaded), strict=True):
-        if np.shape(got) != want.shape or np.asarray(got).dtype != want.dtype:
-            raise CheckpointError(f"{path}: {jax.tree_util.keystr(where)} is {np.shape(got)}, this run's is {want.shape}")
-    return jax.tree.map(lambda like, x: jax.random.wrap_key_data(x) if _is_key(like) else jnp.asarray(x), blank, loaded)
+        raise CheckpointError(f"{path}: is damaged ({type(reason).__name__})") from reason
+    for name in sorted(names ^ set(want)):
+        raise CheckpointError(f"{path}: is of another run, {name} is {'unknown here' if name in names else 'missing'}")
+    for name, like in want.items():
+        if np.shape(got[name]) != like.shape or np.asarray(got[name]).dtype != like.dtype:
+            raise CheckpointError(f"{path}: is of another run, {name} is {np.shape(got[name])}, here {like.shape}")
+
+    def restored(path, like):
+        leaf = jnp.asarray(got[_name(path)])
+        return jax.random.wrap_key_data(leaf) if _is_key(like) else leaf
+
+    return jax.tree.map_with_path(restored, blank)
 
 
 def _is_key(x) -> bool:
     return jnp.issubdtype(x.dtype, jax.dtypes.prng_key)
 
 
-def _plain(state: TrainState) -> TrainState:
-    """The state with its keys as the numbers they are made of."""
-    return jax.tree.map(lambda x: jax.random.key_data(x) if _is_key(x) else x, state)
+def _plain(state: TrainState) -> dict[str, jax.Array]:
+    """The state's arrays by name; keys as the numbers they are made of."""
+    return {_name(path): jax.random.key_data(x) if _is_key(x) else x for path, x in jax.tree.leaves_with_path(state)}
+
+
+def _name(path) -> str:
+    return jax.tree_util.keystr(path, simple=True, separator=".")

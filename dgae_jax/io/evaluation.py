@@ -10,7 +10,7 @@ import numpy as np
 
 from dgae_jax.build import make_greedy, make_task
 from dgae_jax.config import Config
-from dgae_jax.envs.registry import TASKS
+from dgae_jax.envs.registry import BRAX, TASKS
 from dgae_jax.io import checkpoint
 from dgae_jax.rollout import evaluate
 from dgae_jax.types import TrainState
@@ -26,7 +26,7 @@ def evaluate_state(state: TrainState, config: Config, *, engine: str, episodes: 
     per_run = [run(one, greedy, config, engine, episodes, seed) for one in states]
     return {
         "engine": engine,
-        "env": TASKS[config.env].REFEREE,
+        "env": referee(config),
         "episodes": episodes * config.num_seeds,
         **_summary(np.concatenate(per_run)),
         "seeds": [{"seed": config.seed + i, **_summary(returns)} for i, returns in enumerate(per_run)],
@@ -38,6 +38,13 @@ def evaluate_run(run_dir: Path, config: Config, *, engine: str, episodes: int, s
     newest = checkpoint.latest(run_dir)
     state = checkpoint.load(newest, config)
     return {**evaluate_state(state, config, engine=engine, episodes=episodes, seed=seed), "checkpoint": newest.name}
+
+
+def referee(config: Config) -> str:
+    """Gymnasium's name of the task, or Brax's."""
+    if config.env.startswith(BRAX):
+        return config.env
+    return f"{TASKS[config.env].NAME}-{config.env_version}"
 
 
 def _summary(returns: np.ndarray) -> dict[str, Any]:
@@ -60,7 +67,7 @@ def _in_gymnasium(state: TrainState, greedy, config: Config, engine: str, episod
 
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # that v4 is not the newest version is known
-        worlds = [gymnasium.make(TASKS[config.env].REFEREE, max_episode_steps=config.episode_length) for _ in range(episodes)]
+        worlds = [gymnasium.make(referee(config), max_episode_steps=config.episode_length) for _ in range(episodes)]
     obs = np.stack([world.reset(seed=seed + i)[0] for i, world in enumerate(worlds)])
     total, alive = np.zeros(episodes), np.full(episodes, True)
     while alive.any():

@@ -11,9 +11,11 @@ import numpy as np
 
 from dgae_jax.build import make_task, make_trainer, seed_keys
 from dgae_jax.config import Config, ConfigError, resolve, validate
+from dgae_jax.envs.registry import BRAX
 from dgae_jax.io import checkpoint, metrics, plots, run_directory
 from dgae_jax.io.evaluation import evaluate_state
 from dgae_jax.io.progress import Reporter
+from dgae_jax.physics.base import PhysicsState
 from dgae_jax.types import TrainState
 
 CAPACITY = 64
@@ -34,6 +36,8 @@ class RunOptions:
     """Samples of each run between checkpoints; one is always saved at the end [environment steps]."""
     episodes: int = 20
     """Episodes of the final evaluation in Gymnasium, per run [episodes]."""
+    debug_nonfinite: bool = False
+    """Write the state and action of worlds that turn non-finite to nonfinite/ in the run directory, for replay."""
 
 
 def validate_options(options: RunOptions) -> None:
@@ -55,7 +59,7 @@ def train(config: Config, options: RunOptions) -> int:
     use_cache(options.cache_dir)
     run_directory.create(run_dir, config)
     print(_budget(config))
-    if config.physics == "mjx" and jax.default_backend() == "cpu":
+    if config.physics == "mjx" and jax.default_backend() == "cpu" and not config.env.startswith(BRAX):
         print("no accelerator: --physics native starts and runs faster here")
     with _Signals() as signals:
         state = _iterate(config, options, run_dir, signals)
@@ -98,6 +102,8 @@ def _iterate(config: Config, options: RunOptions, run_dir: Path, signals: "_Sign
             since = time.monotonic()
             state, measured = trainer.dispatch(config, state, count)
             new = file.append(measured, count, time.monotonic() - began)
+            if options.debug_nonfinite:
+                _save_incidents(state, new, run_dir / "nonfinite")
             seconds, first = (time.monotonic() - since) / count, done == 0
             rows, done = rows + new, done + count
             returns = [row["episode_return"] for row in new[-config.num_seeds :] if row["episode_return"] is not None]
@@ -120,8 +126,19 @@ def _save(state: TrainState, rows: list[dict[str, Any]], config: Config, run_dir
     plots.save(plots.learning_curve(rows, title), run_dir / "curve.png")
 
 
+def _save_incidents(state: TrainState, rows: list[dict[str, Any]], directory: Path) -> None:
+    """The last state and action, per run and dispatch, from which a world turned non-finite: arrays 0, 1, … and action."""
+    for seed in sorted({row["seed"] for row in rows if row["nonfinite"]}):
+        world, action = jax.tree.map(lambda x, i=seed - rows[0]["seed"]: np.asarray(x[i]), state.episodes.incident)
+        names = world._fields if isinstance(world, PhysicsState) else range(len(jax.tree.leaves(world)))
+        directory.mkdir(exist_ok=True)
+        arrays = {str(name): leaf for name, leaf in zip(names, jax.tree.leaves(world), strict=True)}
+        np.savez(directory / f"steps_{rows[-1]['steps']:012d}_seed_{seed}.npz", **arrays, action=action)
+
+
 def _evaluate(state: TrainState, config: Config, episodes: int, run_dir: Path) -> int:
-    result = evaluate_state(state, config, engine="gymnasium", episodes=episodes)
+    engine = "mjx" if config.env.startswith(BRAX) else "gymnasium"
+    result = evaluate_state(state, config, engine=engine, episodes=episodes)
     run_directory.write_json(run_dir / "evaluation.json", result)
     print(f"{describe(result)}; files in {run_dir}", flush=True)
     return 0
