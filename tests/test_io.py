@@ -10,7 +10,7 @@ from matplotlib.image import imread
 
 import dgae_jax as dg
 from dgae_jax.build import make_task, make_trainer, seed_keys
-from dgae_jax.config import ConfigError
+from dgae_jax.config import ConfigError, to_dict
 from dgae_jax.io import checkpoint, metrics, plots, run_directory
 from dgae_jax.io.checkpoint import CheckpointError
 from dgae_jax.io.evaluation import evaluate_state
@@ -47,6 +47,8 @@ def test_only_the_newest_checkpoints_are_kept(state, tmp_path):
         (lambda b: b[:100], "is damaged"),
         (lambda b: b"", "is damaged"),
         (lambda b: b"\x00" * 50, "is damaged"),
+        (lambda b: b"\xa3abc", "is damaged"),
+        (lambda b: b"\x93\x01\xa1a\x02", "is damaged"),
         (lambda b: b.replace(b"critic", b"cretic"), "is of another run, cretic.* is unknown here"),
     ],
 )
@@ -137,6 +139,17 @@ def test_a_config_file_that_is_none_is_refused(text, tmp_path):
     (tmp_path / "config.json").write_text(text)
     with pytest.raises(ConfigError, match=r"config\.json"):
         run_directory.read_config(tmp_path)
+
+
+def test_a_config_file_with_an_impossible_value_is_refused(tmp_path):
+    run_directory.write_json(tmp_path / "config.json", to_dict(dataclasses.replace(SMALL, env="hoper")))
+    with pytest.raises(ConfigError, match=r"config\.json: --env hoper: must be one of"):
+        run_directory.read_config(tmp_path)
+
+
+def test_an_environment_of_braxs_own_is_evaluated_in_mjx_only(state):
+    with pytest.raises(ConfigError, match=r"--engine gymnasium: must be mjx"):
+        evaluate_state(state, dataclasses.replace(SMALL, env="brax:ant"), engine="gymnasium", episodes=1)
 
 
 @pytest.mark.parametrize("engine", ["gymnasium", "native"])

@@ -45,7 +45,7 @@ def load(path: Path, config: Config) -> TrainState:
     want = jax.eval_shape(_plain, blank)
     try:
         got = serialization.msgpack_restore(path.read_bytes())
-        names = set(got)
+        names = set(map(str, got.keys()))
     except OSError as reason:
         raise CheckpointError(f"{path}: cannot be read ({reason.strerror})") from reason
     except Exception as reason:  # the decoder raises many kinds for damaged bytes

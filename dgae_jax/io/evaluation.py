@@ -9,7 +9,7 @@ import jax
 import numpy as np
 
 from dgae_jax.build import make_greedy, make_task
-from dgae_jax.config import Config
+from dgae_jax.config import Config, ConfigError
 from dgae_jax.envs.registry import BRAX, TASKS
 from dgae_jax.io import checkpoint
 from dgae_jax.rollout import evaluate
@@ -20,6 +20,8 @@ ENGINES = ("gymnasium", "native", "mjx")
 
 def evaluate_state(state: TrainState, config: Config, *, engine: str, episodes: int, seed: int = 0) -> dict[str, Any]:
     """Undiscounted returns of every run in `state`; mean and standard deviation are over all their episodes."""
+    if config.env.startswith(BRAX) and engine != "mjx":
+        raise ConfigError(f"--engine {engine}: must be mjx with an environment of Brax's own ({config.env})")
     run = _in_gymnasium if engine == "gymnasium" else _in_jax
     greedy = jax.jit(make_greedy(make_task(config), config))
     states = [jax.tree.map(lambda x, i=i: x[i], state) for i in range(config.num_seeds)]

@@ -11,7 +11,7 @@ from typing import Any
 
 import jax
 
-from dgae_jax.config import Config, ConfigError, from_dict, to_dict
+from dgae_jax.config import Config, ConfigError, from_dict, to_dict, validate
 
 _VERSIONS_OF = ("dgae_jax", "jax", "jaxlib", "flax", "optax", "brax", "mujoco", "mujoco-mjx", "gymnasium", "numpy")
 
@@ -39,7 +39,9 @@ def create(path: Path, config: Config) -> None:
 def read_config(path: Path) -> Config:
     """The configuration of a run; raises ConfigError if `path` is not a run directory."""
     try:
-        return from_dict(json.loads((path / "config.json").read_text()))
+        config = from_dict(json.loads((path / "config.json").read_text()))
+        validate(config)
+        return config
     except OSError as reason:
         raise ConfigError(f"{path}: must be a run directory with a config.json ({reason.strerror})") from reason
     except ValueError as reason:
