@@ -97,7 +97,7 @@ def _iterate(config: Config, options: RunOptions, run_dir: Path, signals: "_Sign
     reporter = Reporter(config.iterations * config.samples, config.num_seeds)
     try:
         state = trainer.init(config, seed_keys(config))
-        while done < config.iterations and not signals.received:
+        while done == 0 or (done < config.iterations and not signals.received):  # a signal while compiling still gets its checkpoint
             count = min(count, config.iterations - done, every - done % every)
             since = time.monotonic()
             state, measured = trainer.dispatch(config, state, count)
