@@ -9,7 +9,7 @@ from jaxtyping import Array, ArrayLike, Key
 
 from dgae_jax import gaussian, normalizers
 from dgae_jax.returns import decay, lambda_sum
-from dgae_jax.rollout import rollout, start
+from dgae_jax.rollout import Act, Episodes, rollout, start
 from dgae_jax.statistics import explained_variance
 from dgae_jax.types import Algorithm, Batch, Fit, TrainState, Transition
 
@@ -46,45 +46,21 @@ def make_train(
             iteration=jnp.int32(0),
         )
 
-    def act_with(state: TrainState):
-        def act(key, obs):
-            distribution = algorithm.policy.apply(state.policy.params, normalizers.normalize(state.observations, obs))
-            action = gaussian.sample(key, distribution)
-            return action, gaussian.log_prob(distribution, action)
-
-        return act
-
-    def learn_from(state: TrainState, step: Transition, reward: Array, key: Array) -> tuple[Batch, Metrics]:
-        obs, next_obs = (normalizers.normalize(state.observations, x) for x in (step.obs, step.next_obs))
-        quantiles, next_quantiles = (algorithm.critic.predict(state.critic.params, x) for x in (obs, next_obs))
-        discount, trace = decay(step.terminated, step.truncated, gamma=gamma, lam=lam)
-        residual = algorithm.residual(reward, discount, quantiles, next_quantiles)
-        advantage = lambda_sum(residual, discount * trace)
-        target = algorithm.critic.target(key, reward, discount, trace, quantiles, next_quantiles)
-        standard = (advantage - advantage.mean()) / (advantage.std() + 1e-8)
-        batch = Batch(obs, step.action, step.log_prob, standard, target, reward, discount, next_obs)
-        value = quantiles.mean(-1)
-        metrics = {"critic/value": value.mean(), "critic/explained_variance": explained_variance(value, value + advantage)}
-        return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), batch), metrics
-
     @jax.default_matmul_precision("highest")  # TF32 ruins training on GPUs that default to it
     def train_step(state: TrainState) -> tuple[TrainState, Metrics]:
         act_key, target_key, policy_key, critic_key, key = jax.random.split(state.key, 5)
-        episodes, step = rollout(env, act_with(state), state.episodes, act_key, horizon=horizon, episode_length=episode_length)
+        episodes, step = rollout(env, _acting(algorithm, state), state.episodes, act_key, horizon=horizon, episode_length=episode_length)
         returns, reward = state.returns, step.reward
         if normalize_rewards:
             done = (step.terminated | step.truncated).astype(reward.dtype)
             returns, reward = normalizers.rescale(returns, reward, done, gamma)
-        batch, estimates = learn_from(state, step, reward, target_key)
+        batch, estimates = _estimate(algorithm, state, step, reward, target_key, gamma, lam)
         policy, improved = algorithm.improve.step(policy_key, state.policy, batch)
         critic, evaluated = algorithm.evaluate.step(critic_key, state.critic, batch)
         observations = normalizers.observe(state.observations, step.obs) if normalize_observations else state.observations
         metrics = {
-            "episode_return": jnp.nanmean(episodes.last_total),
-            "episode_length": jnp.nanmean(episodes.last_steps),
-            "episodes": (step.terminated | step.truncated).sum(),
+            **_account(episodes, step),
             "nonfinite": episodes.nonfinite - state.episodes.nonfinite,
-            "reward": step.reward.mean(),
             **{f"policy/{name}": value for name, value in improved.items()},
             **{f"critic/{name}": value for name, value in evaluated.items()},
             **estimates,
@@ -92,3 +68,41 @@ def make_train(
         return TrainState(policy, critic, observations, returns, episodes, key, state.iteration + 1), metrics
 
     return init, train_step
+
+
+def _acting(algorithm: Algorithm, state: TrainState) -> Act:
+    """The policy under the statistics of this iteration."""
+
+    def act(key: Array, obs: Array) -> tuple[Array, Array]:
+        distribution = algorithm.policy.apply(state.policy.params, normalizers.normalize(state.observations, obs))
+        action = gaussian.sample(key, distribution)
+        return action, gaussian.log_prob(distribution, action)
+
+    return act
+
+
+def _estimate(
+    algorithm: Algorithm, state: TrainState, step: Transition, reward: Array, key: Array, gamma: ArrayLike, lam: ArrayLike
+) -> tuple[Batch, Metrics]:
+    """What the updates learn from: standardised advantages, and the critic's target, from the critic that acted."""
+    obs, next_obs = (normalizers.normalize(state.observations, x) for x in (step.obs, step.next_obs))
+    quantiles, next_quantiles = (algorithm.critic.predict(state.critic.params, x) for x in (obs, next_obs))
+    discount, trace = decay(step.terminated, step.truncated, gamma=gamma, lam=lam)
+    residual = algorithm.residual(reward, discount, quantiles, next_quantiles)
+    advantage = lambda_sum(residual, discount * trace)
+    target = algorithm.critic.target(key, reward, discount, trace, quantiles, next_quantiles)
+    standard = (advantage - advantage.mean()) / (advantage.std() + 1e-8)
+    batch = Batch(obs, step.action, step.log_prob, standard, target, reward, discount, next_obs)
+    value = quantiles.mean(-1)
+    metrics = {"critic/value": value.mean(), "critic/explained_variance": explained_variance(value, value + advantage)}
+    return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), batch), metrics
+
+
+def _account(episodes: Episodes, step: Transition) -> Metrics:
+    """How the episodes went, in raw rewards."""
+    return {
+        "episode_return": jnp.nanmean(episodes.last_total),
+        "episode_length": jnp.nanmean(episodes.last_steps),
+        "episodes": (step.terminated | step.truncated).sum(),
+        "reward": step.reward.mean(),
+    }
