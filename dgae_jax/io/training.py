@@ -31,7 +31,7 @@ class RunOptions:
     run_dir: Path | None = None
     """Directory to write, new or empty; by default runs/ENV-ALGO-SEED-TIME [path]."""
     cache_dir: str = "~/.cache/dgae_jax"
-    """Where compiled programs are kept between runs; none disables [path]."""
+    """Where compiled programs are kept between runs (JAX keeps those of mjx, not of native); none disables [path]."""
     checkpoint_every: int = 200_000
     """Samples of each run between checkpoints; one is always saved at the end [environment steps]."""
     episodes: int = 20
