@@ -185,9 +185,13 @@ def test_brax_finds_the_tasks_by_name():
 
 
 @pytest.mark.slow
-def test_braxs_own_trainer_trains_on_a_task():
+def test_braxs_own_trainer_trains_on_a_task(monkeypatch):
     from brax.training.agents.ppo import train as ppo
 
+    def replicated(tree, devices):  # Brax 0.14 calls this function of JAX's, which JAX 0.10 no longer has
+        return jax.tree.map(lambda x: jnp.stack([x] * len(devices)), tree)
+
+    monkeypatch.setattr(jax, "device_put_replicated", replicated, raising=False)
     seen = []
     ppo.train(
         environment=brax.envs.get_environment("dgae_hopper", physics="mjx"),
