@@ -98,6 +98,34 @@ def test_mjx_agrees_with_c_mujoco_after_a_control_interval(name):
 
 
 @pytest.mark.parametrize("name", MODELS)
+def test_in_float64_mjx_differs_from_c_mujoco_by_rounding(name):
+    with jax.enable_x64(True):
+        physics = mjx(load_spec(TASKS[name].FILE["v4"]), TASKS[name].FRAME_SKIP, max_contacts=TASKS[name].CONTACTS)
+        qpos, qvel, warmstart, ctrl = (jnp.asarray(x.astype(float)) for x in states(name))
+        got = jax.jit(jax.vmap(physics.step))(physics.at_pose(qpos, qvel)._replace(warmstart=warmstart), ctrl)
+    got, model = jax.tree.map(np.asarray, got), model_of(name)
+    data, errors = mujoco.MjData(model), []
+    for i, (qpos, qvel, warmstart, ctrl) in enumerate(zip(*states(name), strict=True)):
+        data.qpos[:], data.qvel[:], data.qacc_warmstart[:], data.ctrl[:] = qpos, qvel, warmstart, ctrl
+        mujoco.mj_step(model, data, nstep=TASKS[name].FRAME_SKIP)
+        errors.append(max(np.abs(data.qpos - got.qpos[i]).max(), np.abs(data.qvel - got.qvel[i]).max()))
+    # C's solver stops at a tolerance, which Ant's light legs show
+    assert np.quantile(errors, 0.99) < 1e-7
+    assert max(errors) < (1e-4 if name == "ant" else 1e-9)
+
+
+def test_worlds_in_blocks_and_under_nested_vmaps_move_as_each_alone():
+    physics, (qpos, qvel, _, ctrl) = mjx(load_spec("hopper.xml"), 4), map(jnp.asarray, states("hopper"))
+    many = [jnp.concatenate([x, x, x]) for x in (qpos, qvel, ctrl)]  # three blocks
+    step = jax.jit(jax.vmap(lambda q, v, u: physics.step(physics.at_pose(q, v), u)))
+    blocks, one = step(*many), step(qpos, qvel, ctrl)
+    nested = jax.jit(jax.vmap(jax.vmap(lambda q, v: physics.step(physics.at_pose(q, v), ctrl[0]))))
+    assert_allclose(blocks.qvel, jnp.concatenate([one.qvel] * 3), atol=1e-5)
+    folded = nested(qpos.reshape(8, 16, -1), qvel.reshape(8, 16, -1)).qvel.reshape(COUNT, -1)
+    assert_allclose(folded, step(qpos, qvel, jnp.broadcast_to(ctrl[0], ctrl.shape)).qvel, atol=1e-5)
+
+
+@pytest.mark.parametrize("name", MODELS)
 def test_the_states_reach_contacts_and_never_more_than_the_limit(name):
     contacts, limit = reference(name)[1], TASKS[name].CONTACTS
     if limit is None:

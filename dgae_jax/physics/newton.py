@@ -13,6 +13,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from dgae_jax.physics import spatial
+
 ITERATIONS = 20
 """Most Newton steps; measured, the tasks need at most a dozen."""
 LINE_SEARCH = 8
@@ -20,117 +22,91 @@ LINE_SEARCH = 8
 
 
 class Problem(NamedTuple):
-    """The quantities above, for one world: V degrees of freedom, C constraint rows."""
+    """The quantities above, for W worlds: V degrees of freedom, C constraint rows."""
 
-    mass: Float[Array, "V V"]
-    smooth: Float[Array, " V"]
-    """a₀."""
-    force: Float[Array, " V"]
+    mass: Float[Array, "V V W"]
+    force: Float[Array, "V W"]
     """M a₀."""
-    jacobian_t: Float[Array, "V C"]
-    """Jᵀ: with the rows along the last axis JᵀDJ takes half the time on a CPU."""
-    stiffness: Float[Array, " C"]
-    """D, the inverse of the regularisation."""
-    reference: Float[Array, " C"]
+    jacobian: Float[Array, "V C W"]
+    """Jᵀ."""
+    stiffness: Float[Array, "C W"]
+    """D, the inverse of the regularisation; zero for a row that does not count."""
+    reference: Float[Array, "C W"]
 
 
 class Solution(NamedTuple):
     """The optimum, and how it was reached."""
 
-    acceleration: Float[Array, " V"]
-    residual: Float[Array, " C"]
-    """J a − a_ref; rows below zero are active and push with −D times it."""
-    iterations: Int[Array, ""]
-
-
-def _cost(p: Problem, a: Array, r: Array) -> Array:
-    return 0.5 * jnp.dot(a - p.smooth, p.mass @ a - p.force) + 0.5 * jnp.sum(p.stiffness * jnp.minimum(r, 0) ** 2)
+    acceleration: Float[Array, "V W"]
+    push: Float[Array, "C W"]
+    """The force along each row."""
+    iterations: Int[Array, " W"]
 
 
 class _Iterate(NamedTuple):
-    a: Float[Array, " V"]
-    r: Float[Array, " C"]
-    done: Bool[Array, ""]
-    n: Int[Array, ""]
+    a: Float[Array, "V W"]
+    r: Float[Array, "C W"]
+    """J a − a_ref."""
+    g: Float[Array, "V W"]
+    """M (a − a₀)."""
+    done: Bool[Array, " W"]
+    n: Int[Array, " W"]
 
 
-@jax.custom_batching.custom_vmap
-def solve(p: Problem, guess: Float[Array, " V"]) -> Solution:
-    """From the better of `guess` and a₀ to the optimum, in at most `ITERATIONS` steps."""
-    return _solution(_finish(p, _start(p, guess)))
+def solve(p: Problem, guess: Float[Array, "V W"]) -> Solution:
+    """From a guess to the optimum, in at most `ITERATIONS` steps.
 
-
-@solve.def_vmap
-def _solve_many(size: int, batched, p: Problem, guess: Array) -> tuple[Solution, Solution]:
-    """All worlds take two steps together; those that need more go on in groups, until no world is left.
-
-    A loop over all of them would turn as often as its slowest world needs.
+    All worlds take one step together; those that need more go on in groups of a quarter, until no world is left: a loop
+    over all of them would turn as often as its slowest world needs.
     """
-    p, guess = jax.tree.map(lambda x, has: x if has else jnp.broadcast_to(x, (size, *x.shape)), (p, guess), tuple(batched))
-    state = jax.vmap(_start)(p, guess)
-    for _ in range(2):
-        state = jax.vmap(_continue)(p, state)
-    group = min(size, max(16, size // 8))
+    r, g = spatial.combine(p.jacobian, guess) - p.reference, spatial.combine(p.mass, guess) - p.force
+    none = jnp.zeros(guess.shape[-1:], bool)
+    state = _newton(p, _Iterate(guess, r, g, none, none.astype(jnp.int32)))
+    group = -(-len(none) // 4)
 
     def finish_some(state: _Iterate) -> _Iterate:
-        _, worlds = jax.lax.top_k(~state.done, group)
-        some = jax.vmap(_finish)(*jax.tree.map(lambda x: x[worlds], (p, state)))
-        return jax.tree.map(lambda all, part: all.at[worlds].set(part), state, some)
+        _, some = jax.lax.top_k(~state.done, group)
+        problem, part = jax.tree.map(lambda x: x[..., some], (p, state))
+        part = jax.lax.while_loop(lambda s: ~s.done.all(), lambda s: _newton(problem, s), part)
+        return jax.tree.map(lambda all, part: all.at[..., some].set(part), state, part)
 
     state = jax.lax.while_loop(lambda s: ~s.done.all(), finish_some, state)
-    solution = jax.vmap(_solution)(state)
-    return solution, jax.tree.map(lambda _: True, solution)
-
-
-def _start(p: Problem, guess: Array) -> _Iterate:
-    r_guess, r_smooth = guess @ p.jacobian_t - p.reference, p.smooth @ p.jacobian_t - p.reference
-    warm = _cost(p, guess, r_guess) < _cost(p, p.smooth, r_smooth)
-    return _Iterate(jnp.where(warm, guess, p.smooth), jnp.where(warm, r_guess, r_smooth), jnp.array(False), jnp.int32(0))
+    return Solution(state.a, -p.stiffness * jnp.minimum(state.r, 0), state.n)
 
 
 def _newton(p: Problem, s: _Iterate) -> _Iterate:
     weight = jnp.where(s.r < 0, p.stiffness, 0)
-    residual = p.mass @ s.a - p.force
-    hessian = p.mass + (p.jacobian_t * weight) @ p.jacobian_t.T
-    step = -_solve_spd(hessian, residual + p.jacobian_t @ (weight * s.r))
-    moves = step @ p.jacobian_t
-    length = _line_search(jnp.dot(step, residual), jnp.dot(step, p.mass @ step), p.stiffness, s.r, moves)
-    a, r = s.a + length * step, s.r + length * moves
-    stands = jnp.all((r < 0) == (s.r < 0)) & (jnp.abs(length - 1) < 1e-3)
-    tiny = jnp.max(jnp.abs(length * step)) <= 4 * jnp.finfo(a.dtype).eps * jnp.max(jnp.abs(a))
-    return _Iterate(a, r, stands | tiny | (s.n + 1 >= ITERATIONS), s.n + 1)
-
-
-def _continue(p: Problem, s: _Iterate) -> _Iterate:
-    return jax.tree.map(lambda old, new: jnp.where(s.done, old, new), s, _newton(p, s))
-
-
-def _finish(p: Problem, s: _Iterate) -> _Iterate:
-    return jax.lax.while_loop(lambda s: ~s.done, lambda s: _newton(p, s), s)
-
-
-def _solution(s: _Iterate) -> Solution:
-    return Solution(s.a, s.r, s.n)
-
-
-def _solve_spd(matrix: Float[Array, "V V"], vector: Float[Array, " V"]) -> Float[Array, " V"]:
-    return jax.scipy.linalg.cho_solve(jax.scipy.linalg.cho_factor(matrix), vector)
+    rows = range(len(weight))
+    weighted = p.jacobian * weight
+    hessian = p.mass + sum(weighted[:, None, c] * p.jacobian[None, :, c] for c in rows)
+    step = -spatial.solve(hessian, s.g + sum(weighted[:, c] * s.r[c] for c in rows))
+    moves, push = spatial.combine(p.jacobian, step), spatial.combine(p.mass, step)
+    slope, curvature = spatial.dot(step, s.g), spatial.dot(step, push)
+    length = _line_search(slope, curvature, p.stiffness, s.r, moves)
+    a, r, g = s.a + length * step, s.r + length * moves, s.g + length * push
+    stands = jnp.all((r < 0) == (s.r < 0), 0) & (jnp.abs(length - 1) < 1e-3)
+    tiny = jnp.max(jnp.abs(length * step), 0) <= 4 * jnp.finfo(a.dtype).eps * jnp.max(jnp.abs(a), 0)
+    new = _Iterate(a, r, g, stands | tiny | (s.n + 1 >= ITERATIONS), s.n + 1)
+    return jax.tree.map(lambda old, new: jnp.where(s.done, old, new), s, new)
 
 
 def _line_search(slope0: Array, curvature: Array, stiffness: Array, r: Array, moves: Array) -> Array:
     """The length that minimises the cost along a step: safeguarded Newton on its piecewise linear derivative."""
     linear, quadratic = stiffness * moves * r, stiffness * moves * moves
 
-    def refine(carry, _):
-        length, low, high = carry
+    def refine(carry):
+        length, low, high, _, n = carry
         active = (r + length * moves) < 0
-        intercept, gradient = slope0 + jnp.sum(linear * active), curvature + jnp.sum(quadratic * active)
+        intercept = slope0 + jnp.sum(jnp.where(active, linear, 0), 0)
+        gradient = curvature + jnp.sum(jnp.where(active, quadratic, 0), 0)
         slope = intercept + length * gradient
         low, high = jnp.where(slope < 0, length, low), jnp.where(slope > 0, length, high)
         root = -intercept / gradient
         outside = jnp.where(jnp.isfinite(high), 0.5 * (low + high), root)
-        return (jnp.where((root >= low) & (root <= high), root, outside), low, high), None
+        new = jnp.where((root >= low) & (root <= high), root, outside)
+        return new, low, high, length, n + 1
 
     one = jnp.ones_like(slope0)
-    (length, _, _), _ = jax.lax.scan(refine, (one, 0 * one, jnp.inf * one), None, length=LINE_SEARCH, unroll=LINE_SEARCH)
+    going = lambda c: (c[4] < LINE_SEARCH) & (jnp.abs(c[0] - c[3]) > 1e-6 * c[0]).any()
+    length = jax.lax.while_loop(going, refine, (one, 0 * one, jnp.inf * one, 0 * one, 0))[0]
     return jnp.where(jnp.isfinite(length), length, 0)

@@ -1,0 +1,288 @@
+"""Joint limits, contacts of spheres and capsules with the ground and each other, and the constraint rows of both.
+
+Distances, frames and rows are MuJoCo's: soft constraints, with pyramids for friction cones. A row asks for
+J a ≥ reference, up to its regularisation 1/D; D is zero where nothing is touched.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+from jaxtyping import Array, Float
+
+from dgae_jax.physics.dynamics import Smooth, Tree
+from dgae_jax.physics.spatial import apply, combine, constant, cross, dot, total, unit
+
+_PLANE, _CAPSULE = int(mujoco.mjtGeom.mjGEOM_PLANE), int(mujoco.mjtGeom.mjGEOM_CAPSULE)
+
+
+class Softness(NamedTuple):
+    """How each of K limits or contacts gives way."""
+
+    margin: np.ndarray
+    inverse_weight: np.ndarray
+    stiffness: np.ndarray
+    """Of the reference acceleration [1/s²]."""
+    damping: np.ndarray
+    """[1/s]."""
+    impedance: np.ndarray
+    """[K 5] MuJoCo's `solimp`."""
+
+
+class Ends(NamedTuple):
+    """K points with a radius, fixed to frames."""
+
+    frame: np.ndarray
+    centre: np.ndarray
+    """[K 3]."""
+    half: np.ndarray
+    """[K 3] half the axis of the capsule; zero for a sphere."""
+    radius: np.ndarray
+
+
+class Touching(NamedTuple):
+    """The constants of K contacts that may happen."""
+
+    softness: Softness
+    friction: np.ndarray
+    moves: np.ndarray
+    """[K V] how a degree of freedom moves the second body against the first: 1, 0 or −1."""
+    bodies: np.ndarray
+    """[K 2]."""
+
+
+class Group(NamedTuple):
+    """Contacts that are found and kept in the same way."""
+
+    touching: Touching
+    first: Ends | None
+    """None for the ground."""
+    second: Ends
+    plane: np.ndarray
+    """[K 4] normal and offset of the ground."""
+    frictionless: bool
+    most: int
+    """How many are kept, the nearest ones."""
+
+
+class Scene(NamedTuple):
+    """All that may constrain a tree."""
+
+    limited: np.ndarray
+    """The joints with limits."""
+    softness: Softness
+    """Of the limits."""
+    groups: list[Group]
+
+
+class Met(NamedTuple):
+    """Where K contacts are, with their constants as arrays."""
+
+    touching: Touching
+    distance: Float[Array, "K W"]
+    position: Float[Array, "K 3 W"]
+    normal: Float[Array, "K 3 W"]
+    """From the first body to the second."""
+    tangent: Float[Array, "K 3 W"]
+
+
+class Rows(NamedTuple):
+    """C constraint rows."""
+
+    jacobian: Float[Array, "V C W"]
+    stiffness: Float[Array, "C W"]
+    """D."""
+    reference: Float[Array, "C W"]
+
+
+def scene_of(tree: Tree, most: int | None = None) -> Scene:
+    """Read limits and contacts of a model; `most` bounds the contacts with the ground, of which the nearest are kept."""
+    model = tree.model
+    limited = np.flatnonzero(model.jnt_limited)
+    weights = model.dof_invweight0[model.jnt_dofadr[limited]]
+    softness = _softness(model, model.jnt_margin[limited], weights, model.jnt_solref[limited], model.jnt_solimp[limited])
+    pairs: dict[tuple[bool, bool], list[tuple[int, int]]] = {}
+    for one, two in _pairs(model):
+        kind = bool(model.geom_type[one] == _PLANE), bool(max(model.geom_condim[[one, two]]) == 1)
+        pairs.setdefault(kind, []).append((one, two))
+    groups = [_group(tree, np.array(p), ground, frictionless, most) for (ground, frictionless), p in pairs.items()]
+    return Scene(limited, softness, groups)
+
+
+def _pairs(model: mujoco.MjModel):
+    """The pairs of geoms that MuJoCo tests, ordered by their type."""
+    weld, geoms = model.body_weldid, np.lexsort((np.arange(model.ngeom), model.geom_type))
+    for i, one in enumerate(geoms):
+        for two in geoms[i + 1 :]:
+            a, b = (weld[model.geom_bodyid[g]] for g in (one, two))
+            related = a and b and (weld[model.body_parentid[a]] == b or weld[model.body_parentid[b]] == a)
+            wanted = model.geom_contype[one] & model.geom_conaffinity[two] or model.geom_contype[two] & model.geom_conaffinity[one]
+            if a != b and not related and wanted:
+                yield int(one), int(two)
+
+
+def _group(tree: Tree, pairs: np.ndarray, ground: bool, frictionless: bool, most: int | None) -> Group:
+    model = tree.model
+    if ground:  # a capsule touches the ground with either end
+        tips = np.array([(*pair, sign) for pair in pairs for sign in ((1, -1) if model.geom_type[pair[1]] == _CAPSULE else (1,))])
+        pairs, second = tips[:, :2], _ends(tree, tips[:, 1])
+        second = second._replace(centre=second.centre + tips[:, 2:] * second.half)
+    else:
+        second = _ends(tree, pairs[:, 1])
+    one, two = pairs.T
+    bodies = model.geom_bodyid[pairs]
+    friction = np.maximum(model.geom_friction[one, 0], model.geom_friction[two, 0])
+    weight = model.body_invweight0[bodies, 0].sum(1)
+    if not frictionless:
+        weight = 2 * friction**2 / model.opt.impratio * (1 + friction**2) * weight
+    mean = lambda x: 0.5 * (x[one] + x[two])
+    softness = _softness(model, model.geom_margin[pairs].sum(1), weight, mean(model.geom_solref), mean(model.geom_solimp))
+    moves = np.concatenate([np.zeros((1, model.nv)), tree.moves])[bodies]
+    normals = np.array([tree.bodies[0].at(np.zeros(3), model.geom_quat[g]).rotation[:, 2] for g in one])
+    plane = np.c_[normals, (normals * model.geom_pos[one]).sum(1)]
+    touching = Touching(softness, friction, moves[:, 1] - moves[:, 0], bodies)
+    kept = min(len(pairs), most) if ground and most is not None else len(pairs)
+    return Group(touching, None if ground else _ends(tree, one), second, plane, frictionless, kept)
+
+
+def _ends(tree: Tree, geoms: np.ndarray) -> Ends:
+    model = tree.model
+    poses = [tree.bodies[model.geom_bodyid[g]].at(model.geom_pos[g], model.geom_quat[g]) for g in geoms]
+    length = model.geom_size[geoms, 1] * (model.geom_type[geoms] == _CAPSULE)
+    half = np.array([pose.rotation[:, 2] for pose in poses]) * length[:, None]
+    return Ends(np.array([pose.frame for pose in poses]), np.array([pose.position for pose in poses]), half, model.geom_size[geoms, 0])
+
+
+def _softness(model: mujoco.MjModel, margin: np.ndarray, weight: np.ndarray, solref: np.ndarray, solimp: np.ndarray) -> Softness:
+    """MuJoCo's stiffness and damping from `solref`, given as time constant and damping ratio or, negative, directly."""
+    low, high, width, middle, power = solimp.T
+    low, high, middle = (np.clip(x, mujoco.mjMINIMP, mujoco.mjMAXIMP) for x in (low, high, middle))
+    time, ratio = solref.T
+    safe = np.maximum(time, 2 * model.opt.timestep)
+    stiffness = np.where(time > 0, 1 / (high * safe * ratio) ** 2, -time / high**2)
+    damping = np.where(ratio > 0, 2 / (high * safe), -ratio / high)
+    impedance = np.stack([low, high, np.maximum(width, mujoco.mjMINVAL), middle, np.maximum(power, 1)], 1)
+    return Softness(margin, weight, stiffness, damping, impedance)
+
+
+def constrain(scene: Scene, tree: Tree, smooth: Smooth, qpos: Array, qvel: Array) -> tuple[Rows, list[Met]]:
+    """The constraint rows of all limits, then of all contacts, and where the contacts are."""
+    met = [_meet(group, smooth.frames) for group in scene.groups]
+    parts = [_limit_rows(scene, tree.model, qpos, qvel)] if len(scene.limited) else []
+    parts += [_contact_rows(group.frictionless, m, smooth, qvel) for group, m in zip(scene.groups, met, strict=True)]
+    jacobian, stiffness, reference = zip(*parts, strict=True)
+    return Rows(jnp.concatenate(jacobian, 1), jnp.concatenate(stiffness), jnp.concatenate(reference)), met
+
+
+def _limit_rows(scene: Scene, model: mujoco.MjModel, qpos: Array, qvel: Array) -> Rows:
+    low, high = (constant(x, qpos.dtype) for x in model.jnt_range[scene.limited].T)
+    q = qpos[model.jnt_qposadr[scene.limited]]
+    below = q - low < high - q
+    axis = constant(np.eye(model.nv)[:, model.jnt_dofadr[scene.limited]], qpos.dtype)
+    return _rows(_arrays(scene.softness, qpos.dtype), axis * jnp.where(below, 1, -1), jnp.where(below, q - low, high - q), qvel)
+
+
+def _contact_rows(frictionless: bool, met: Met, smooth: Smooth, qvel: Array) -> Rows:
+    arm, (angular, linear) = met.position - smooth.centre, (smooth.axes[:, None, :3], smooth.axes[:, None, 3:])
+    moved = (linear + cross(angular, arm[None])) * jnp.swapaxes(met.touching.moves, 0, 1)[:, :, None]
+    jacobian = normal = dot(moved, met.normal)
+    if not frictionless:  # the four edges of a pyramid
+        slides = [met.touching.friction * dot(moved, t) for t in (met.tangent, cross(met.normal, met.tangent))]
+        jacobian = jnp.concatenate([normal + sign * slide for slide in slides for sign in (1, -1)], 1)
+    edges = jacobian.shape[1] // normal.shape[1]
+    repeat = lambda x: jnp.concatenate([x] * edges)
+    return _rows(jax.tree.map(repeat, met.touching.softness), jacobian, repeat(met.distance), qvel)
+
+
+def _rows(softness: Softness, jacobian: Array, distance: Array, qvel: Array) -> Rows:
+    """MuJoCo's impedance, regularisation and reference acceleration."""
+    gap = distance - softness.margin
+    low, high, width, middle, power = (softness.impedance[:, i] for i in range(5))
+    x = jnp.minimum(jnp.abs(gap) / width, 1)
+    rise = jnp.where(x < middle, x * (x / middle) ** (power - 1), 1 - (1 - x) * ((1 - x) / (1 - middle)) ** (power - 1))
+    impedance = low + rise * (high - low)
+    regularisation = jnp.maximum(softness.inverse_weight * (1 - impedance) / impedance, mujoco.mjMINVAL)
+    reference = -softness.damping * combine(jacobian, qvel) - softness.stiffness * impedance * gap
+    return Rows(jacobian, jnp.where(gap < 0, 1 / regularisation, 0), reference)
+
+
+def _arrays(constants, dtype):
+    return jax.tree.map(lambda x: constant(x, dtype), constants)
+
+
+def _place(ends: Ends, frames: Array) -> tuple[Array, Array]:
+    """Centres and half axes in the world."""
+    here = frames[ends.frame]
+    turn = here[:, :, :3]
+    return here[:, :, 3] + apply(turn, constant(ends.centre, frames.dtype)), apply(turn, constant(ends.half, frames.dtype))
+
+
+def _meet(group: Group, frames: Array) -> Met:
+    centre, half = _place(group.second, frames)
+    if group.first is not None:
+        return _between(group, *_place(group.first, frames), centre, half)
+    plane, radius = constant(group.plane, frames.dtype), constant(group.second.radius, frames.dtype)
+    distance, normal = dot(centre, plane[:, :3]) - plane[:, 3] - radius, plane[:, :3] + 0 * centre
+    position = centre - normal * (radius + 0.5 * distance)[:, None]
+    flat = half - normal * dot(half, normal)[:, None]  # the capsule's axis on the ground
+    upright = dot(flat, flat) <= 1e-12 * dot(half, half)
+    return _nearest(group, distance, position, normal, jnp.where(upright[:, None], _any_tangent(normal), unit(flat)))
+
+
+def _between(group: Group, one: Array, half_one: Array, two: Array, half_two: Array) -> Met:
+    """Nearest points of two segments: of the first's line to the second's, cut to the segments one after the other."""
+    a, b, c = dot(half_one, half_one), -dot(half_one, half_two), dot(half_two, half_two)
+    u, v = dot(half_one, two - one), dot(half_two, one - two)
+    over = lambda x, y: x / jnp.where(y > 0, y, 1)
+    x = jnp.clip(over(c * u - b * v, a * c - b * b), -1, 1)
+    y = jnp.clip(over(v - b * x, c), -1, 1)
+    x = jnp.clip(over(u - b * y, a), -1, 1)
+    start, reach = one + x[:, None] * half_one, two + y[:, None] * half_two - one - x[:, None] * half_one
+    radii = [constant(e.radius, one.dtype) for e in (group.first, group.second) if e is not None]
+    distance, normal = jnp.sqrt(dot(reach, reach)) - sum(radii), unit(reach)
+    return _nearest(group, distance, start + normal * (radii[0] + 0.5 * distance)[:, None], normal, _any_tangent(normal))
+
+
+def _any_tangent(normal: Array) -> Array:
+    """MuJoCo's tangent where nothing else gives one: y, or z where the normal is along y."""
+    y, z = constant(np.array([0, 1.0, 0]), normal.dtype), constant(np.array([0, 0, 1.0]), normal.dtype)
+    axis = jnp.where(jnp.abs(normal[:, 1:2]) < 0.5, y, z)
+    return unit(axis - normal * dot(axis + 0 * normal, normal)[:, None])
+
+
+def _nearest(group: Group, distance: Array, *where: Array) -> Met:
+    """All contacts of a group, or as many of the nearest as are kept."""
+    if group.most == len(distance):
+        return Met(_arrays(group.touching, distance.dtype), distance, *where)
+    chosen = jax.lax.top_k(-distance.T, group.most)[1].T
+
+    def constants(x: np.ndarray) -> Array:
+        if (x == x[:1]).all():
+            return constant(x[: group.most], distance.dtype)
+        return jnp.moveaxis(jnp.take(jnp.asarray(np.moveaxis(x, 0, -1), distance.dtype), chosen, axis=-1), -2, 0)
+
+    def take(x: Array) -> Array:
+        return jnp.take_along_axis(x, chosen.reshape(group.most, *(1,) * (x.ndim - 2), -1), 0)
+
+    return Met(jax.tree.map(constants, group.touching), *map(take, (distance, *where)))
+
+
+def contact_forces(scene: Scene, model: mujoco.MjModel, met: list[Met], centre: Array, pushes: Array) -> Float[Array, "B 6 W"]:
+    """Torque about the tree's centre of mass and force on each body, MuJoCo's `cfrc_ext`, from the forces along the rows."""
+    out, at = jnp.zeros((model.nbody, 6, centre.shape[-1]), centre.dtype), len(scene.limited)
+    for group, m in zip(scene.groups, met, strict=True):
+        edges, count = 1 if group.frictionless else 4, len(m.distance)
+        push = pushes[at : at + edges * count].reshape(edges, count, -1)
+        at += edges * count
+        force = m.normal * push.sum(0)[:, None]
+        if not group.frictionless:
+            for tangent, (plus, minus) in ((m.tangent, push[:2]), (cross(m.normal, m.tangent), push[2:])):
+                force += tangent * (m.touching.friction * (plus - minus))[:, None]
+        wrench = jnp.concatenate([cross(m.position - centre, force), force], 1)
+        bodies = jnp.arange(model.nbody)[:, None, None]
+        for side, sign in ((0, -1), (1, 1)):
+            on = jnp.where(m.touching.bodies[:, side] == bodies, sign, 0) * (bodies > 0)
+            out += jnp.sum(on[:, :, None] * wrench, 1)
+    return out
