@@ -10,6 +10,7 @@ from numpy.testing import assert_allclose
 from dgae_jax.envs.registry import TASKS
 from dgae_jax.envs.task import load_spec
 from dgae_jax.physics import contacts, dynamics, spatial
+from dgae_jax.physics.scene import scene_of
 
 # a floating tree that uses what the four tasks do not: anchors off the origin, springs, a body without joints, any orientation
 SPRINGY = """
@@ -66,7 +67,7 @@ def test_constraint_rows_are_mujocos(name):
     model = model_of(name)
     with jax.enable_x64(True):
         tree = dynamics.tree_of(model)
-        scene = contacts.scene_of(tree)
+        scene = scene_of(tree)
 
         def rows(qpos, qvel, ctrl):
             return contacts.constrain(scene, tree, dynamics.smooth(tree, qpos, qvel, ctrl), qpos, qvel)[0]

@@ -1,24 +1,25 @@
-"""MuJoCo in JAX, stepped so that it compiles fast, runs fast and agrees with C.
+"""MuJoCo in JAX, stepped so that it compiles fast, runs as fast as C on a core and agrees with it.
 
+- The world is the last axis of every array, so that all arithmetic runs along it; the stages of MuJoCo's forward dynamics
+  (`dynamics`, `contacts`, `newton`) are written for that, and each agrees with C's.
 - The forward dynamics appear once in the program: RK4 is a scan over its tableau inside the scan over substeps.
-- The constraint solver is `newton`: it reaches the optimum in a few steps, where MJX's own spends its time in a line search
-  that vmap never cuts short.
-- Two places where MJX 3.17 differs from C are put right: the tangent of a plane–capsule contact, which C always takes
-  along the capsule's axis, and the rotation of a free joint, which C integrates with RKMK's correction since MuJoCo 4.
+- The rotation of a free joint is integrated with RKMK's correction from MuJoCo 4 on, as C does.
 """
 
 import jax
 import jax.numpy as jnp
 import mujoco
-import numpy as np
 from jaxtyping import Array
 
 from dgae_jax.physics import contacts, dynamics, newton, spatial
 from dgae_jax.physics.base import Physics, PhysicsState
+from dgae_jax.physics.coverage import refuse_uncovered
+from dgae_jax.physics.scene import scene_of
 
 _STAGE = (0.0, 0.5, 0.5, 1.0)
 _WEIGHT = (1 / 6, 1 / 3, 1 / 3, 1 / 6)
 _BLOCK = 128
+"""Worlds computed together on a CPU, so that what they need fits its cache."""
 _CORRECTS_ROTATION = int(mujoco.__version__.split(".")[0]) >= 4
 
 
@@ -28,9 +29,9 @@ def mjx(spec: mujoco.MjSpec, frame_skip: int, *, contact_forces: bool = False, m
     `max_contacts` bounds the contacts with the ground; the nearest are kept.
     """
     model = spec.compile()
-    _refuse_uncovered(model)
+    refuse_uncovered(model)
     tree = dynamics.tree_of(model)
-    scene = contacts.scene_of(tree, max_contacts)
+    scene = scene_of(tree, max_contacts)
     h, free = model.opt.timestep, tree.floating
 
     def forward(guess, qpos, qvel, ctrl):
@@ -71,7 +72,7 @@ def mjx(spec: mujoco.MjSpec, frame_skip: int, *, contact_forces: bool = False, m
 
 
 def _in_blocks(advance):
-    """On a CPU, blocks of worlds one after the other: what they compute fits its cache."""
+    """On a CPU, worlds in blocks, one after the other."""
 
     def blocks(state: PhysicsState, ctrl: Array) -> PhysicsState:
         worlds = ctrl.shape[-1]
@@ -95,10 +96,13 @@ def _of_one_world(advance):
     @many.def_vmap
     def _(size, batched, *args):
         worlds = args[1].shape[-1]
-        last = lambda x, has: jnp.moveaxis(x, 0, -2) if has else jnp.repeat(x[..., None, :], size, -2)
-        merged = jax.tree.map(lambda x, has: last(x, has).reshape(*x.shape[has:-1], size * worlds), args, tuple(batched))
-        out = jax.tree.map(lambda x: jnp.moveaxis(x.reshape(*x.shape[:-1], size, worlds), -2, 0), many(*merged))
-        return out, jax.tree.map(lambda _: True, out)
+
+        def merge(x, has):
+            x = jnp.moveaxis(x, 0, -2) if has else jnp.repeat(x[..., None, :], size, -2)
+            return x.reshape(*x.shape[:-2], size * worlds)
+
+        out = many(*jax.tree.map(merge, args, tuple(batched)))
+        return jax.tree.map(lambda x: jnp.moveaxis(x.reshape(*x.shape[:-1], size, worlds), -2, 0), out), jax.tree.map(lambda _: True, out)
 
     def step(state: PhysicsState, ctrl: Array) -> PhysicsState:
         return jax.tree.map(lambda x: x[..., 0], many(*jax.tree.map(lambda x: x[..., None], (state, ctrl))))
@@ -117,38 +121,3 @@ def _inverse_exponential(theta: Array, omega: Array) -> Array:
     """dexp⁻¹: the rate of a rotation vector θ while the body turns at ω, to fourth order (Munthe-Kaas 1998)."""
     once = spatial.cross(theta, omega)
     return omega + 0.5 * once + spatial.cross(theta, once) / 12
-
-
-def _refuse_uncovered(model: mujoco.MjModel) -> None:
-    joint, geom = mujoco.mjtJoint, mujoco.mjtGeom
-    plain = [int(joint.mjJNT_SLIDE), int(joint.mjJNT_HINGE)]
-    collides = (model.geom_contype | model.geom_conaffinity) > 0
-    fixed = model.body_weldid[model.geom_bodyid] == 0
-    round_ = np.isin(model.geom_type, [int(geom.mjGEOM_SPHERE), int(geom.mjGEOM_CAPSULE)])
-    motor = model.actuator_trntype == int(mujoco.mjtTrn.mjTRN_JOINT)
-    motor &= (model.actuator_gaintype == int(mujoco.mjtGain.mjGAIN_FIXED)) & (model.actuator_biastype == int(mujoco.mjtBias.mjBIAS_NONE))
-    forced = model.actuator_forcelimited.any() or model.jnt_actfrclimited.any()
-    reasons = {
-        f"integrator {mujoco.mjtIntegrator(model.opt.integrator).name}": model.opt.integrator != mujoco.mjtIntegrator.mjINT_RK4,
-        "ball joints, or free joints below the root": not (np.isin(model.jnt_type, plain) | ((model.jnt_type == 0) & (np.arange(model.njnt) == 0))).all(),
-        "more than one tree": (model.body_rootid[1:] != 1).any(),
-        "activations": model.na > 0,
-        "actuators other than motors at joints": not motor.all(),
-        "force limits": forced,
-        "equality constraints": model.neq > 0,
-        "friction loss": (model.dof_frictionloss > 0).any() or (model.tendon_frictionloss > 0).any(),
-        "elliptic friction cones": model.opt.cone != mujoco.mjtCone.mjCONE_PYRAMIDAL,
-        "tendons": model.ntendon > 0,
-        "a spring at a free joint": bool((model.jnt_stiffness[model.jnt_type == 0] > 0).any()),
-        "gravity compensation": bool((model.body_gravcomp != 0).any()),
-        "wind": bool((model.opt.wind != 0).any()),
-        "the ellipsoid fluid model": bool((model.geom_fluid[:, 0] != 0).any()),
-        "disabled or enabled features": bool(model.opt.disableflags or model.opt.enableflags),
-        "colliding geoms other than spheres, capsules and a ground plane": not (np.where(fixed, model.geom_type == int(geom.mjGEOM_PLANE), round_) | ~collides).all(),
-        "contact pairs or exclusions": model.npair + model.nexclude > 0,
-        "contacts with torsional friction": bool((model.geom_condim > 3).any()),
-        "geoms of different priority or weight": bool((model.geom_priority != model.geom_priority[0]).any() or (model.geom_solmix != model.geom_solmix[0]).any()),
-    }
-    found = [reason for reason, present in reasons.items() if present]
-    if found:
-        raise ValueError(f"physics mjx does not cover {', '.join(found)}, which the model has")

@@ -18,7 +18,7 @@ from dgae_jax.physics import spatial
 ITERATIONS = 20
 """Most Newton steps; measured, the tasks need at most a dozen."""
 LINE_SEARCH = 8
-"""Steps of the exact line search on a piecewise quadratic."""
+"""Most steps of the exact line search on a piecewise quadratic."""
 
 
 class Problem(NamedTuple):
@@ -106,7 +106,10 @@ def _line_search(slope0: Array, curvature: Array, stiffness: Array, r: Array, mo
         new = jnp.where((root >= low) & (root <= high), root, outside)
         return new, low, high, length, n + 1
 
+    def moving(carry):
+        length, _, _, before, n = carry
+        return (n < LINE_SEARCH) & (jnp.abs(length - before) > 1e-6 * length).any()
+
     one = jnp.ones_like(slope0)
-    going = lambda c: (c[4] < LINE_SEARCH) & (jnp.abs(c[0] - c[3]) > 1e-6 * c[0]).any()
-    length = jax.lax.while_loop(going, refine, (one, 0 * one, jnp.inf * one, 0 * one, 0))[0]
+    length = jax.lax.while_loop(moving, refine, (one, 0 * one, jnp.inf * one, 0 * one, 0))[0]
     return jnp.where(jnp.isfinite(length), length, 0)
