@@ -1,8 +1,9 @@
 """From a configuration to the things it names."""
 
+import dataclasses
 from collections.abc import Callable
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -11,11 +12,13 @@ from brax.envs.base import Env
 from dgae_jax import train
 from dgae_jax.algorithms import TABLE
 from dgae_jax.config import Config, CriticConfig, PolicyConfig, resolve
+from dgae_jax.critics import CRITICS, RESIDUALS
+from dgae_jax.distortion import weights_of
 from dgae_jax.envs.registry import make_env
 from dgae_jax.networks import gaussian_policy
 from dgae_jax.normalizers import normalize
 from dgae_jax.types import Algorithm, Policy, TrainState
-from dgae_jax.updates import Loss, adam, sgd, surrogate
+from dgae_jax.updates import DESCENT, UPDATES, descend
 
 
 def make_task(config: Config) -> Env:
@@ -32,22 +35,27 @@ def make_policy(env: Env, config: Config) -> Policy:
 
 
 def make_algorithm(name: str, env: Env, config: Config) -> Algorithm:
-    """The record of parts that `name` stands for, sized for `env`.
+    """The record of parts that `name` stands for, sized for `env`; parts that `config` names take the place of the row's.
 
     Raises ValueError, naming what exists, for an unknown name.
     """
     if name not in TABLE:
         raise ValueError(f"unknown algorithm {name!r}; choose from {', '.join(TABLE)}")
-    row, policy, settings = TABLE[name], make_policy(env, config), resolve(config).critic
-    options = {option: getattr(settings, option) for option in row.critic_options}
-    critic = row.critic(_size(env), hidden=settings.hidden, target=settings.target, **options)
+    config = resolve(dataclasses.replace(config, algo=name))
+    policy, iterations, fit = make_policy(env, config), config.total_steps / config.samples, config.critic
+    kind, improve = CRITICS[fit.kind], UPDATES[config.policy.update]
+    critic = kind.build(_size(env), hidden=fit.hidden, target=fit.target, **_options(fit, kind.options))
     return Algorithm(
         policy=policy,
         critic=critic,
-        residual=row.residual,
-        improve=_fit(surrogate(policy, config.policy.clip), config.policy, config),
-        evaluate=_fit(critic.loss, config.critic, config),
+        residual=RESIDUALS[config.residual].build(weights_of(config.metric, fit.quantiles)),
+        improve=improve.build(policy, iterations, **_options(config.policy, improve.options)),
+        evaluate=descend(critic.loss, iterations, **_options(fit, DESCENT)),
     )
+
+
+def _options(settings: PolicyConfig | CriticConfig, names: tuple[str, ...]) -> dict[str, Any]:
+    return {name: getattr(settings, name) for name in names}
 
 
 def make_train(
@@ -69,14 +77,6 @@ def make_train(
 
 def _size(env: Env) -> int:
     return int(env.observation_size)  # pyright: ignore[reportArgumentType]
-
-
-def _fit(loss: Loss, settings: PolicyConfig | CriticConfig, config: Config):
-    steps = config.total_steps / config.samples * settings.epochs * settings.minibatches
-    optimizer = adam(
-        settings.learning_rate, final_fraction=settings.learning_rate_end, gradient_steps=steps, max_norm=settings.max_grad_norm
-    )
-    return sgd(loss, optimizer, epochs=settings.epochs, minibatches=settings.minibatches)
 
 
 class Trainer(NamedTuple):

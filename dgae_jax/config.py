@@ -13,9 +13,11 @@ import brax.envs
 import jax
 
 from dgae_jax.algorithms import TABLE
-from dgae_jax.critics import TARGETS
+from dgae_jax.critics import CRITICS, RESIDUALS, TARGETS
+from dgae_jax.distortion import weights_of
 from dgae_jax.envs.registry import BRAX, PHYSICS, TASKS, VERSIONS
 from dgae_jax.networks import COVARIANCES
+from dgae_jax.updates import OPTIMIZERS, UPDATES
 
 LARGEST_BUDGET = 2**31 - 1
 
@@ -34,10 +36,13 @@ def _traced(*names: str):
     return register
 
 
-@_traced("learning_rate", "learning_rate_end", "max_grad_norm", "clip", "initial_std")
+@_traced("learning_rate", "learning_rate_end", "max_grad_norm", "clip", "initial_std", "radius", "damping")
 @dataclass(frozen=True)
 class PolicyConfig:
     """The policy network and how it improves."""
+
+    update: str = "default"
+    """clip (PPO), gradient (A2C) or trust-region (TRPO); default: the algorithm's own."""
 
     hidden: tuple[int, ...] = (64, 64)
     """Width of each hidden layer [units]."""
@@ -47,8 +52,20 @@ class PolicyConfig:
     """Deviation of the first actions [units of the action]."""
     clip: float = 0.2
     """PPO's clip range epsilon of the probability ratio [1]."""
+    radius: float = 0.01
+    """Trust region: largest mean KL divergence of a step [nats]."""
+    damping: float = 0.1
+    """Trust region: multiple of the identity added to the Fisher matrix [1]."""
+    cg_iterations: int = 10
+    """Trust region: iterations of conjugate gradient [1]."""
+    backtracks: int = 10
+    """Trust region: times a step is halved before it is given up [1]."""
+    fisher_every: int = 1
+    """Trust region: the Fisher matrix is taken over every n-th sample [samples]."""
+    optimizer: str = "adam"
+    """adam or rmsprop."""
     learning_rate: float = 3e-4
-    """Adam's learning rate at the start [1]."""
+    """Learning rate at the start [1]."""
     learning_rate_end: float = 0.0
     """Learning rate at the end of the run as a fraction of its start: 1 constant, 0 linear decay to zero [1]."""
     epochs: int = 10
@@ -64,6 +81,9 @@ class PolicyConfig:
 class CriticConfig:
     """The value network and what it is fitted to."""
 
+    kind: str = "default"
+    """scalar (one value) or quantile (a distribution); default: the algorithm's own."""
+
     hidden: tuple[int, ...] = (64, 64)
     """Width of each hidden layer [units]."""
     target: str = "default"
@@ -72,8 +92,10 @@ class CriticConfig:
     """Quantiles K of a distributional critic [1]."""
     kappa: float = 1.0
     """Threshold of the quantile-Huber loss of a distributional critic [units of the scaled return]."""
+    optimizer: str = "adam"
+    """adam or rmsprop."""
     learning_rate: float = 3e-4
-    """Adam's learning rate at the start [1]."""
+    """Learning rate at the start [1]."""
     learning_rate_end: float = 0.0
     """Learning rate at the end of the run as a fraction of its start: 1 constant, 0 linear decay to zero [1]."""
     epochs: int = 10
@@ -94,7 +116,11 @@ class Config:
     env_version: str = "v4"
     """Gymnasium version whose semantics the task has: v4 (the same as Gym's v3) or v5."""
     algo: str = "dppo"
-    """Algorithm: ppo or dppo."""
+    """Algorithm: ppo, trpo, a2c, or with a value distribution dppo, dtrpo, da2c."""
+    residual: str = "default"
+    """One-step residual of the advantage: td (of means) or distributional (by the metric); default: the algorithm's own."""
+    metric: str = "mean"
+    """Preference over value distributions: mean (the paper's), cvar:α, wang:β, power:c or mean-cvar:α:weight."""
     physics: str = "mjx"
     """Engine that simulates the task: mjx (compiled by JAX, CPU or GPU) or native (C MuJoCo, CPU)."""
     seed: int = 0
@@ -174,16 +200,15 @@ def validate(config: Config) -> None:
     _between("gamma", config.gamma, 0, 1)
     _between("lam", config.lam, 0, 1)
     _choice("policy.covariance", config.policy.covariance, COVARIANCES)
-    _choice("critic.target", config.critic.target, ("default", *TARGETS))
+    _choice("residual", config.residual, ("default", *RESIDUALS))
+    for part, name, table in _PARTS:
+        _choice(f"{part}.{name}", getattr(getattr(config, part), name), ("default", *table))
+    _validate_policy(config.policy)
     _positive("critic.quantiles", config.critic.quantiles)
-    for name in ("policy.clip", "policy.initial_std", "critic.kappa"):
-        part, leaf = name.split(".")
-        _above_zero(name, getattr(getattr(config, part), leaf))
+    _above_zero("critic.kappa", config.critic.kappa)
     for part in ("policy", "critic"):
         _validate_fit(config, part)
-    for name in set(_CRITIC_OPTIONS) - set(TABLE[config.algo].critic_options):
-        value = getattr(config.critic, name)
-        _check(f"critic.{name}", value, value == _CRITIC_OPTIONS[name], f"left out: {config.algo} does not use it")
+    _validate_use(config)
     if config.iterations < 1:
         _check("total_steps", config.total_steps, False, f"at least one iteration of num_envs * horizon = {config.samples:,} samples")
 
@@ -198,25 +223,63 @@ def _validate_brax(config: Config) -> None:
     _check("env_version", config.env_version, config.env_version == Config.env_version, "left out with an environment of Brax's own")
 
 
+def _validate_policy(settings: PolicyConfig) -> None:
+    for name in ("clip", "initial_std", "radius", "damping"):
+        _above_zero(f"policy.{name}", getattr(settings, name))
+    for name in ("cg_iterations", "fisher_every"):
+        _positive(f"policy.{name}", getattr(settings, name))
+    _check("policy.backtracks", settings.backtracks, settings.backtracks >= 0, "a whole number of at least 0")
+
+
 def _validate_fit(config: Config, part: str) -> None:
     settings = getattr(config, part)
     _check(f"{part}.hidden", settings.hidden, len(settings.hidden) >= 1 and min(settings.hidden) >= 1, "one or more widths of at least 1")
+    _choice(f"{part}.optimizer", settings.optimizer, OPTIMIZERS)
     _above_zero(f"{part}.learning_rate", settings.learning_rate)
     _between(f"{part}.learning_rate_end", settings.learning_rate_end, 0, 1)
     _above_zero(f"{part}.max_grad_norm", settings.max_grad_norm)
     _positive(f"{part}.epochs", settings.epochs)
     _positive(f"{part}.minibatches", settings.minibatches)
-    divides = config.samples % settings.minibatches == 0
-    _check(f"{part}.minibatches", settings.minibatches, divides, f"a divisor of num_envs * horizon = {config.samples:,}")
+    if part == "critic" or "minibatches" in UPDATES[resolve(config).policy.update].options:
+        divides = config.samples % settings.minibatches == 0
+        _check(f"{part}.minibatches", settings.minibatches, divides, f"a divisor of num_envs * horizon = {config.samples:,}")
 
 
-_CRITIC_OPTIONS = {name: getattr(CriticConfig(), name) for name in {o for row in TABLE.values() for o in row.critic_options}}
+def _validate_use(config: Config) -> None:
+    """No setting that the parts of this run have no use for."""
+    full = resolve(config)
+    for part, group, chosen, table in (
+        ("policy", config.policy, full.policy.update, UPDATES),
+        ("critic", config.critic, full.critic.kind, CRITICS),
+    ):
+        for name in sorted({option for each in table.values() for option in each.options} - set(table[chosen].options)):
+            value, default = getattr(group, name), getattr(type(group)(), name)
+            _check(f"{part}.{name}", value, value == default, f"left out: {config.algo} with {chosen} does not use it")
+    try:
+        weights_of(config.metric, full.critic.quantiles)
+    except ValueError as allowed:
+        _check("metric", config.metric, False, str(allowed))
+    used = config.metric == "mean" or (full.residual == "distributional" and full.critic.kind == "quantile")
+    _check("metric", config.metric, used, "mean, or used with a distributional residual and a quantile critic")
+
+
+_PARTS = (("policy", "update", UPDATES), ("critic", "kind", CRITICS), ("critic", "target", TARGETS))
 
 
 def resolve(config: Config) -> Config:
-    """The configuration with the algorithm's defaults written out."""
-    target = TABLE[config.algo].target if config.critic.target == "default" else config.critic.target
-    return dataclasses.replace(config, critic=dataclasses.replace(config.critic, target=target))
+    """The configuration with the algorithm's own parts written out."""
+    row = TABLE[config.algo]
+
+    def chosen(value: str, own: str) -> str:
+        return own if value == "default" else value
+
+    policy, critic = config.policy, config.critic
+    return dataclasses.replace(
+        config,
+        residual=chosen(config.residual, row.residual),
+        policy=dataclasses.replace(policy, update=chosen(policy.update, row.update)),
+        critic=dataclasses.replace(critic, kind=chosen(critic.kind, row.critic), target=chosen(critic.target, row.target)),
+    )
 
 
 def to_dict(config: Config) -> dict[str, Any]:

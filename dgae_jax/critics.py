@@ -7,9 +7,16 @@ import jax
 from jaxtyping import Array, ArrayLike, Float
 
 from dgae_jax.networks import value_network
-from dgae_jax.returns import bellman_target, lambda_return, lambda_shift_target, sr_lambda_target
+from dgae_jax.returns import (
+    bellman_target,
+    distributional_td_residual,
+    lambda_return,
+    lambda_shift_target,
+    sr_lambda_target,
+    td_residual,
+)
 from dgae_jax.transport import quantile_huber_loss
-from dgae_jax.types import Batch, Critic, Params
+from dgae_jax.types import Batch, Critic, Params, Part
 
 
 class Target(NamedTuple):
@@ -69,3 +76,19 @@ def quantile(obs_size: int, *, hidden: Sequence[int], target: str, quantiles: in
         return quantile_huber_loss(quantiles, target, kappa=kappa)
 
     return _critic(obs_size, quantiles, hidden, target, distance)
+
+
+CRITICS = {"scalar": Part(scalar), "quantile": Part(quantile, ("quantiles", "kappa"))}
+"""What a critic predicts: `build(obs_size, hidden=, target=, **options) -> Critic`."""
+
+
+def _of_means(weights):
+    return lambda reward, discount, z, z_next: td_residual(reward, discount, z.mean(-1), z_next.mean(-1))
+
+
+def _of_distributions(weights):
+    return lambda reward, discount, z, z_next: distributional_td_residual(reward, discount, z, z_next, weights)
+
+
+RESIDUALS = {"td": Part(_of_means), "distributional": Part(_of_distributions, ("metric",))}
+"""How two predictions become one number: `build(weights of the metric) -> residual(reward, discount, z, z_next)`."""

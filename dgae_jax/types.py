@@ -100,3 +100,11 @@ class Algorithm(NamedTuple):
     """The policy step."""
     evaluate: Update
     """The critic fit."""
+
+
+class Part(NamedTuple):
+    """An entry of a table of parts."""
+
+    build: Callable
+    options: tuple[str, ...] = ()
+    """The settings it is built with; it has no use for any other of its group."""

@@ -7,7 +7,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from dgae_jax import critics, gaussian
 from dgae_jax.networks import gaussian_policy
 from dgae_jax.types import Batch, Fit
-from dgae_jax.updates import adam, sgd, surrogate
+from dgae_jax.updates import descent, sgd, surrogate
 
 
 @pytest.fixture
@@ -94,7 +94,7 @@ def test_a_batch_that_does_not_divide_is_refused(policy, params, batch, key):
 
 def test_the_learning_rate_falls_linearly_to_its_last_fraction():
     # Adam's first steps on a constant gradient are one learning rate long
-    optimizer = adam(0.1, final_fraction=0.5, gradient_steps=4, max_norm=1e9)
+    optimizer = descent("adam", 0.1, final_fraction=0.5, gradient_steps=4, max_norm=1e9)
     params = jnp.array([0.0])
     state, steps = optimizer.init(params), []
     for _ in range(6):
@@ -105,7 +105,7 @@ def test_the_learning_rate_falls_linearly_to_its_last_fraction():
 
 def test_the_clip_bounds_the_global_norm_of_a_gradient():
     optimizer = optax.chain(optax.clip_by_global_norm(1.0), optax.sgd(1.0))
-    ours = adam(1.0, final_fraction=1.0, gradient_steps=1, max_norm=1.0)
+    ours = descent("adam", 1.0, final_fraction=1.0, gradient_steps=1, max_norm=1.0)
     gradient = {"a": jnp.array([3.0]), "b": jnp.array([4.0])}
     assert_allclose(optimizer.update(gradient, optimizer.init(gradient))[0]["b"], -0.8)
     moments = ours.update(gradient, ours.init(gradient), gradient)[1]

@@ -1,5 +1,6 @@
 """Command lines: flags from dataclasses, and one clear line for a user's mistake."""
 
+import argparse
 import contextlib
 import io
 import re
@@ -20,12 +21,20 @@ def fail(message: str) -> NoReturn:
     raise SystemExit(2)
 
 
-def parse(cls: type[T], description: str, argv: Sequence[str] | None = None) -> T:
-    """The dataclass `cls` filled from the command line; `--help` explains every field."""
+def peek(argv: Sequence[str] | None = None, **defaults: str) -> dict[str, str]:
+    """The values of some flags, looked at before the rest is parsed; underscores stand for dots."""
+    parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False, exit_on_error=False)
+    for name, default in defaults.items():
+        parser.add_argument("--" + name.replace("_", "."), dest=name, default=default, nargs="?")
+    return {name: value or defaults[name] for name, value in vars(parser.parse_known_args(argv)[0]).items()}
+
+
+def parse(cls: type[T], description: str, argv: Sequence[str] | None = None, default: T | None = None) -> T:
+    """The dataclass `cls` filled from the command line, over `default`; `--help` explains every field."""
     screen = io.StringIO()
     try:
         with contextlib.redirect_stderr(screen):
-            return tyro.cli(cls, description=description, args=argv)
+            return tyro.cli(cls, description=description, args=argv, **({} if default is None else {"default": default}))
     except SystemExit as stop:
         if stop.code in (0, None):
             raise
