@@ -176,9 +176,15 @@ def errors(name: str, poses: tuple[np.ndarray, ...]) -> str:
 def policy_of(run_dir: Path) -> tuple[str, Callable[[np.ndarray], np.ndarray]]:
     """The task of a run and its mean action."""
     config = dataclasses.replace(run_directory.read_config(run_dir), physics="native")
-    state = jax.tree.map(lambda x: x[0], checkpoint.load(checkpoint.latest(run_dir), config))
-    greedy = jax.jit(make_greedy(make_task(config), config))
-    return config.env, lambda obs: np.asarray(greedy(state, obs.astype(np.float32)))
+    with jax.enable_x64(False):  # policies are float32
+        state = jax.tree.map(lambda x: x[0], checkpoint.load(checkpoint.latest(run_dir), config))
+        greedy = jax.jit(make_greedy(make_task(config), config))
+
+    def act(obs: np.ndarray) -> np.ndarray:
+        with jax.enable_x64(False):
+            return np.asarray(greedy(state, obs.astype(np.float32)))
+
+    return config.env, act
 
 
 def main() -> None:

@@ -78,7 +78,7 @@ def trust_region(
         (start, info), gradient = jax.value_and_grad(loss, has_aux=True)(old, batch)
         fisher = fisher_product(policy, old, batch.obs[::fisher_every], damping)
         direction, _ = jax.scipy.sparse.linalg.cg(fisher, jax.tree.map(jnp.negative, gradient), maxiter=cg_iterations, tol=1e-10)
-        curvature = optax.tree_utils.tree_vdot(direction, fisher(direction))
+        curvature = optax.tree.vdot(direction, fisher(direction))
         longest = jnp.sqrt(2 * radius / curvature)
 
         def attempt(halvings):
