@@ -7,8 +7,10 @@ with contextlib.redirect_stdout(io.StringIO()):  # mujoco.mjx prints that it has
     import mujoco.mjx  # noqa: F401
 
 from dgae_jax.build import make_algorithm, make_train
-from dgae_jax.config import Config, ConfigError, CriticConfig, PolicyConfig
+from dgae_jax.config import Config, ConfigError, CriticConfig, NoiseConfig, PolicyConfig
+from dgae_jax.distortion import METRICS, weights_of
 from dgae_jax.envs.registry import make_env
+from dgae_jax.presets import preset
 from dgae_jax.returns import (
     bellman_target,
     dgae,
@@ -27,9 +29,11 @@ from dgae_jax.transport import directional_metric, quantile_huber_loss, quantile
 __version__ = "0.1.0"
 
 __all__ = [
+    "METRICS",
     "Config",
     "ConfigError",
     "CriticConfig",
+    "NoiseConfig",
     "PolicyConfig",
     "bellman_target",
     "bootstrap_interval",
@@ -49,9 +53,11 @@ __all__ = [
     "make_train",
     "n_step_advantage",
     "pit",
+    "preset",
     "quantile_huber_loss",
     "quantile_midpoints",
     "sr_lambda_target",
     "td_residual",
     "wasserstein",
+    "weights_of",
 ]

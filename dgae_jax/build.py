@@ -9,11 +9,12 @@ import jax
 import jax.numpy as jnp
 from brax.envs.base import Env
 
-from dgae_jax import train
+from dgae_jax import diagnostics, train
 from dgae_jax.algorithms import TABLE
 from dgae_jax.config import Config, CriticConfig, PolicyConfig, resolve
 from dgae_jax.critics import CRITICS, RESIDUALS
 from dgae_jax.distortion import weights_of
+from dgae_jax.envs.noise import Noisy
 from dgae_jax.envs.registry import make_env
 from dgae_jax.networks import gaussian_policy
 from dgae_jax.normalizers import normalize
@@ -23,7 +24,8 @@ from dgae_jax.updates import DESCENT, UPDATES, descend
 
 def make_task(config: Config) -> Env:
     """The environment a configuration names."""
-    return make_env(config.env, physics=config.physics, version=config.env_version)
+    env, noise = make_env(config.env, physics=config.physics, version=config.env_version), dataclasses.asdict(config.noise)
+    return Noisy(env, **noise) if any(noise.values()) else env
 
 
 def make_policy(env: Env, config: Config) -> Policy:
@@ -72,6 +74,7 @@ def make_train(
         lam=config.lam,
         normalize_observations=config.normalize_observations,
         normalize_rewards=config.normalize_rewards,
+        diagnose=diagnostics.of_critic if config.diagnostics else diagnostics.nothing,
     )
 
 

@@ -5,21 +5,12 @@ compiled program, and changing one does not compile again. Everything else is st
 """
 
 import dataclasses
-import math
 from dataclasses import dataclass, field, fields
 from typing import Any
 
-import brax.envs
 import jax
 
 from dgae_jax.algorithms import TABLE
-from dgae_jax.critics import CRITICS, RESIDUALS, TARGETS
-from dgae_jax.distortion import weights_of
-from dgae_jax.envs.registry import BRAX, PHYSICS, TASKS, VERSIONS
-from dgae_jax.networks import COVARIANCES
-from dgae_jax.updates import OPTIMIZERS, UPDATES
-
-LARGEST_BUDGET = 2**31 - 1
 
 
 class ConfigError(ValueError):
@@ -106,6 +97,20 @@ class CriticConfig:
     """Largest global norm of a gradient [1]."""
 
 
+@dataclass(frozen=True)
+class NoiseConfig:
+    """Deviations of normal noise on the task, 0 for none; Gymnasium, the referee of evaluations, has none."""
+
+    reward: float = 0.0
+    """On the reward [units of the reward]."""
+    action: float = 0.0
+    """On the action, before it is clipped to the actuators' range [units of the action]."""
+    observation: float = 0.0
+    """On the observation [units of the observation]."""
+    initial: float = 0.0
+    """On positions and velocities at a reset, beside the task's own [m, rad, and per second]."""
+
+
 @_traced("gamma", "lam", "total_steps", "policy", "critic")
 @dataclass(frozen=True)
 class Config:
@@ -143,6 +148,9 @@ class Config:
     """Subtract the running mean of observations and divide by their deviation."""
     normalize_rewards: bool = True
     """Divide rewards by the running deviation of the discounted return."""
+    diagnostics: bool = False
+    """Calibration of the critic in the metrics of every iteration."""
+    noise: NoiseConfig = field(default_factory=NoiseConfig)
     policy: PolicyConfig = field(default_factory=PolicyConfig)
     critic: CriticConfig = field(default_factory=CriticConfig)
 
@@ -155,115 +163,6 @@ class Config:
     def iterations(self) -> int:
         """The largest whole number of iterations within the budget."""
         return self.total_steps // self.samples
-
-
-def flag(path: str) -> str:
-    """The command-line spelling of a field."""
-    return "--" + path.replace("_", "-")
-
-
-def _check(path: str, value: Any, ok: bool, allowed: str) -> None:
-    if not ok:
-        shown = " ".join(map(str, value)) if isinstance(value, tuple) else value
-        raise ConfigError(f"{flag(path)} {shown}: must be {allowed}")
-
-
-def _choice(path: str, value: str, table: Any) -> None:
-    _check(path, value, value in table, f"one of {', '.join(table)}")
-
-
-def _positive(path: str, value: int) -> None:
-    _check(path, value, value >= 1, "a whole number of at least 1")
-
-
-def _between(path: str, value: float, low: float, high: float) -> None:
-    _check(path, value, low <= value <= high, f"a number from {low:g} to {high:g}")
-
-
-def _above_zero(path: str, value: float) -> None:
-    _check(path, value, value > 0 and math.isfinite(value), "a finite number above 0")
-
-
-def validate(config: Config) -> None:
-    """Raise `ConfigError` for the first setting that cannot be, alone or together with the others."""
-    if not config.env.startswith(BRAX):
-        _check("env", config.env, config.env in TASKS, f"one of {', '.join(TASKS)}, or {BRAX}NAME")
-    _choice("env_version", config.env_version, VERSIONS)
-    _choice("algo", config.algo, TABLE)
-    _choice("physics", config.physics, PHYSICS)
-    if config.env.startswith(BRAX):
-        _validate_brax(config)
-    _between("seed", config.seed, 0, 2**32 - 1)
-    for name in ("num_seeds", "total_steps", "num_envs", "horizon", "episode_length"):
-        _positive(name, getattr(config, name))
-    _check("total_steps", config.total_steps, config.total_steps <= LARGEST_BUDGET, f"at most {LARGEST_BUDGET:,}")
-    _between("gamma", config.gamma, 0, 1)
-    _between("lam", config.lam, 0, 1)
-    _choice("policy.covariance", config.policy.covariance, COVARIANCES)
-    _choice("residual", config.residual, ("default", *RESIDUALS))
-    for part, name, table in _PARTS:
-        _choice(f"{part}.{name}", getattr(getattr(config, part), name), ("default", *table))
-    _validate_policy(config.policy)
-    _positive("critic.quantiles", config.critic.quantiles)
-    _above_zero("critic.kappa", config.critic.kappa)
-    for part in ("policy", "critic"):
-        _validate_fit(config, part)
-    _validate_use(config)
-    if config.iterations < 1:
-        _check("total_steps", config.total_steps, False, f"at least one iteration of num_envs * horizon = {config.samples:,} samples")
-
-
-def _validate_brax(config: Config) -> None:
-    name = config.env.removeprefix(BRAX)
-    try:
-        brax.envs.get_environment(name)
-    except KeyError:
-        _check("env", config.env, False, f"one of {', '.join(TASKS)}, or {BRAX}NAME with a name that brax.envs knows")
-    _check("physics", config.physics, config.physics == "mjx", f"mjx with an environment of Brax's own ({config.env})")
-    _check("env_version", config.env_version, config.env_version == Config.env_version, "left out with an environment of Brax's own")
-
-
-def _validate_policy(settings: PolicyConfig) -> None:
-    for name in ("clip", "initial_std", "radius", "damping"):
-        _above_zero(f"policy.{name}", getattr(settings, name))
-    for name in ("cg_iterations", "fisher_every"):
-        _positive(f"policy.{name}", getattr(settings, name))
-    _check("policy.backtracks", settings.backtracks, settings.backtracks >= 0, "a whole number of at least 0")
-
-
-def _validate_fit(config: Config, part: str) -> None:
-    settings = getattr(config, part)
-    _check(f"{part}.hidden", settings.hidden, len(settings.hidden) >= 1 and min(settings.hidden) >= 1, "one or more widths of at least 1")
-    _choice(f"{part}.optimizer", settings.optimizer, OPTIMIZERS)
-    _above_zero(f"{part}.learning_rate", settings.learning_rate)
-    _between(f"{part}.learning_rate_end", settings.learning_rate_end, 0, 1)
-    _above_zero(f"{part}.max_grad_norm", settings.max_grad_norm)
-    _positive(f"{part}.epochs", settings.epochs)
-    _positive(f"{part}.minibatches", settings.minibatches)
-    if part == "critic" or "minibatches" in UPDATES[resolve(config).policy.update].options:
-        divides = config.samples % settings.minibatches == 0
-        _check(f"{part}.minibatches", settings.minibatches, divides, f"a divisor of num_envs * horizon = {config.samples:,}")
-
-
-def _validate_use(config: Config) -> None:
-    """No setting that the parts of this run have no use for."""
-    full = resolve(config)
-    for part, group, chosen, table in (
-        ("policy", config.policy, full.policy.update, UPDATES),
-        ("critic", config.critic, full.critic.kind, CRITICS),
-    ):
-        for name in sorted({option for each in table.values() for option in each.options} - set(table[chosen].options)):
-            value, default = getattr(group, name), getattr(type(group)(), name)
-            _check(f"{part}.{name}", value, value == default, f"left out: {config.algo} with {chosen} does not use it")
-    try:
-        weights_of(config.metric, full.critic.quantiles)
-    except ValueError as allowed:
-        _check("metric", config.metric, False, str(allowed))
-    used = config.metric == "mean" or (full.residual == "distributional" and full.critic.kind == "quantile")
-    _check("metric", config.metric, used, "mean, or used with a distributional residual and a quantile critic")
-
-
-_PARTS = (("policy", "update", UPDATES), ("critic", "kind", CRITICS), ("critic", "target", TARGETS))
 
 
 def resolve(config: Config) -> Config:

@@ -8,6 +8,7 @@ from brax.envs.base import Env
 from jaxtyping import Array, ArrayLike, Key
 
 from dgae_jax import gaussian, normalizers
+from dgae_jax.diagnostics import Diagnose, nothing
 from dgae_jax.returns import decay, lambda_sum
 from dgae_jax.rollout import Act, Episodes, rollout, start
 from dgae_jax.statistics import explained_variance
@@ -27,6 +28,7 @@ def make_train(
     lam: ArrayLike,
     normalize_observations: bool,
     normalize_rewards: bool,
+    diagnose: Diagnose = nothing,
 ) -> tuple[Callable[[Array], TrainState], Callable[[TrainState], tuple[TrainState, Metrics]]]:
     """`init(key) -> state` and `train_step(state) -> (state, metrics)` (Algorithm policy_value_update).
 
@@ -54,7 +56,7 @@ def make_train(
         if normalize_rewards:
             done = (step.terminated | step.truncated).astype(reward.dtype)
             returns, reward = normalizers.rescale(returns, reward, done, gamma)
-        batch, estimates = _estimate(algorithm, state, step, reward, target_key, gamma, lam)
+        batch, estimates = _estimate(algorithm, state, step, reward, target_key, gamma, lam, diagnose)
         policy, improved = algorithm.improve.step(policy_key, state.policy, batch)
         critic, evaluated = algorithm.evaluate.step(critic_key, state.critic, batch)
         observations = normalizers.observe(state.observations, step.obs) if normalize_observations else state.observations
@@ -82,7 +84,14 @@ def _acting(algorithm: Algorithm, state: TrainState) -> Act:
 
 
 def _estimate(
-    algorithm: Algorithm, state: TrainState, step: Transition, reward: Array, key: Array, gamma: ArrayLike, lam: ArrayLike
+    algorithm: Algorithm,
+    state: TrainState,
+    step: Transition,
+    reward: Array,
+    key: Array,
+    gamma: ArrayLike,
+    lam: ArrayLike,
+    diagnose: Diagnose,
 ) -> tuple[Batch, Metrics]:
     """What the updates learn from: standardised advantages, and the critic's target, from the critic that acted."""
     obs, next_obs = (normalizers.normalize(state.observations, x) for x in (step.obs, step.next_obs))
@@ -94,7 +103,12 @@ def _estimate(
     standard = (advantage - advantage.mean()) / (advantage.std() + 1e-8)
     batch = Batch(obs, step.action, step.log_prob, standard, target, reward, discount, next_obs)
     value = quantiles.mean(-1)
-    metrics = {"critic/value": value.mean(), "critic/explained_variance": explained_variance(value, value + advantage)}
+    going = 1.0 - (step.terminated | step.truncated)
+    metrics = {
+        "critic/value": value.mean(),
+        "critic/explained_variance": explained_variance(value, value + advantage),
+        **diagnose(reward, discount, going, quantiles, next_quantiles),
+    }
     return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), batch), metrics
 
 

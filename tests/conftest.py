@@ -6,7 +6,7 @@ import tempfile
 import jaxtyping
 
 ARRAYS = """
-    transport returns gaussian statistics networks physics critics updates normalizers envs rollout train
+    transport returns gaussian statistics distortion networks physics critics updates normalizers diagnostics envs rollout train
 """
 jaxtyping.install_import_hook([f"dgae_jax.{module}" for module in ARRAYS.split()], "beartype.beartype")
 

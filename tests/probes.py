@@ -59,6 +59,35 @@ class Target(Env):
         return state.replace(reward=-((action[0] - 0.5 * state.obs[0]) ** 2), done=jnp.ones(()))
 
 
+class Delayed(Env):
+    """Three steps of which only the last pays, 8: with γ = ½ the values are 2, 4, 8. The observation says which step it is."""
+
+    observation_size, action_size, backend = 3, 1, "none"
+    action_range = (jnp.array([-1.0]), jnp.array([1.0]))
+
+    def reset(self, rng):
+        zero = jnp.zeros(())
+        return State(zero, jnp.array([1.0, 0, 0]), zero, zero)
+
+    def step(self, state, action):
+        last = state.obs[2]
+        return state.replace(obs=jnp.roll(state.obs, 1) * (1 - last), reward=8 * last, done=last)
+
+
+class Coin(Env):
+    """One-step episodes that pay 1 or −1 by a coin nobody sees."""
+
+    observation_size, action_size, backend = 1, 1, "none"
+    action_range = (jnp.array([-1.0]), jnp.array([1.0]))
+
+    def reset(self, rng):
+        zero = jnp.zeros(())
+        return State(jax.random.rademacher(rng, (), jnp.float32), jnp.ones(1), zero, zero)
+
+    def step(self, state, action):
+        return state.replace(reward=state.pipeline_state, done=jnp.ones(()))
+
+
 class Constant(Env):
     """Reward 1 at every step, for ever: the value is 1 / (1 − γ) everywhere."""
 

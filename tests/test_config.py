@@ -5,7 +5,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dgae_jax.config import Config, ConfigError, CriticConfig, PolicyConfig, from_dict, resolve, to_dict, validate
+from dgae_jax.config import Config, ConfigError, CriticConfig, PolicyConfig, from_dict, resolve, to_dict
+from dgae_jax.validation import validate
 
 
 def changed(path, value):
@@ -59,7 +60,7 @@ def test_a_bad_value_is_refused_by_flag_value_and_what_is_allowed(path, value, a
 
 
 def test_a_setting_the_algorithm_does_not_use_is_refused():
-    with pytest.raises(ConfigError, match=r"--critic.quantiles 32: must be left out: ppo does not use it"):
+    with pytest.raises(ConfigError, match=r"--critic.quantiles 32: must be left out: ppo with scalar does not use it"):
         validate(dataclasses.replace(changed("critic.quantiles", 32), algo="ppo"))
 
 

@@ -12,7 +12,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 import dgae_jax as dg
 from dgae_jax import normalizers
 from dgae_jax.build import make_greedy, make_trainer, seed_keys
-from tests.probes import Constant, Fragile, Target
+from tests.probes import Coin, Constant, Delayed, Fragile, Target
 
 SMALL = dg.Config(
     physics="native",
@@ -53,7 +53,7 @@ def test_same_key_same_bits_whatever_the_number_of_iterations_per_dispatch(algo)
     assert int(together.iteration[0]) == 3
 
 
-@pytest.mark.parametrize("algo", ["ppo", "dppo"])
+@pytest.mark.parametrize("algo", ["ppo", "dppo", "dtrpo", "da2c"])
 def test_metrics_are_finite_and_the_iteration_learns_from_every_sample(algo):
     config, trainer = hopper(algo)
     _, rows = trainer.dispatch(config, fresh(trainer, config), 4)
@@ -111,18 +111,22 @@ def test_a_seed_trained_beside_others_starts_from_the_same_state_as_alone():
     assert_same_bits(beside, fresh(trainer, dataclasses.replace(config, seed=6)))
 
 
+ALL = ["ppo", "dppo", "trpo", "dtrpo", "a2c", "da2c"]
+
+
 def learn(env, algo, iterations, **changes):
     fit = {"hidden": (16,), "epochs": 4, "minibatches": 4, "learning_rate": 3e-3, "learning_rate_end": 1.0}
+    policy = {**fit, "epochs": 1, "minibatches": 1, "learning_rate": 3e-2} if "a2c" in algo else fit
+    critic = dg.CriticConfig(**fit, quantiles=8, **changes.pop("critic", {}))
     config = dg.Config(
-        algo=algo, num_envs=32, horizon=8, total_steps=256 * iterations,
-        policy=dg.PolicyConfig(**fit, initial_std=0.5), critic=dg.CriticConfig(**fit, quantiles=8, **changes.pop("critic", {})), **changes,
-    )  # fmt: skip
+        algo=algo, num_envs=32, horizon=8, total_steps=256 * iterations, policy=dg.PolicyConfig(**policy), critic=critic, **changes
+    )
     trainer = make_trainer(env, iterations)
     state, rows = trainer.dispatch(config, trainer.init(config, seed_keys(config)), iterations)
     return config, jax.tree.map(lambda x: x[0], state), rows
 
 
-@pytest.mark.parametrize("algo", ["ppo", "dppo"])
+@pytest.mark.parametrize("algo", ALL)
 def test_the_policy_finds_the_best_action_for_each_observation(algo):
     env = Target()
     config, state, _ = learn(env, algo, 40)
@@ -137,6 +141,25 @@ def test_the_critic_finds_the_value_of_a_constant_reward(algo, target):
     off = {"normalize_rewards": False, "normalize_observations": False}
     _, _, rows = learn(Constant(), algo, 60, gamma=0.5, episode_length=5, critic={"target": target}, **off)
     assert_allclose(rows["critic/value"][-1, 0], 2.0, atol=0.05)
+
+
+@pytest.mark.parametrize("algo", ["ppo", "da2c"])
+def test_the_critic_finds_values_that_are_paid_later(algo):
+    off = {"normalize_rewards": False, "normalize_observations": False}
+    env = Delayed()
+    config, state, _ = learn(env, algo, 80, gamma=0.5, **off)
+    critic = dg.make_algorithm(algo, env, config).critic
+    assert_allclose(critic.predict(state.critic.params, jnp.eye(3)).mean(-1), [2, 4, 8], atol=0.3)
+
+
+def test_a_distributional_critic_finds_the_distribution_of_a_noisy_reward():
+    off = {"normalize_rewards": False, "normalize_observations": False}
+    env = Coin()
+    config, state, rows = learn(env, "dtrpo", 80, critic={"kappa": 0.05}, diagnostics=True, **off)
+    quantiles = dg.make_algorithm("dtrpo", env, config).critic.predict(state.critic.params, jnp.ones(1))
+    assert_allclose(jnp.sort(quantiles), [-1] * 4 + [1] * 4, atol=0.35)
+    assert_allclose(rows["critic/wasserstein"][-1, 0], 1.0, atol=0.25)  # half of its mass is 2 away from either outcome
+    assert rows["critic/similar_means"].shape == (80, 1)
 
 
 @pytest.mark.parametrize("where", ["state", "reward", "observation"])

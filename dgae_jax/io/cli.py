@@ -6,7 +6,7 @@ import io
 import re
 import sys
 from collections.abc import Sequence
-from typing import NoReturn, TypeVar
+from typing import Any, NoReturn, TypeVar
 
 import tyro
 
@@ -31,10 +31,11 @@ def peek(argv: Sequence[str] | None = None, **defaults: str) -> dict[str, str]:
 
 def parse(cls: type[T], description: str, argv: Sequence[str] | None = None, default: T | None = None) -> T:
     """The dataclass `cls` filled from the command line, over `default`; `--help` explains every field."""
+    over: dict[str, Any] = {} if default is None else {"default": default}
     screen = io.StringIO()
     try:
         with contextlib.redirect_stderr(screen):
-            return tyro.cli(cls, description=description, args=argv, **({} if default is None else {"default": default}))
+            return tyro.cli(cls, description=description, args=argv, **over)
     except SystemExit as stop:
         if stop.code in (0, None):
             raise

@@ -50,7 +50,18 @@ def referee(config: Config) -> str:
 
 
 def _summary(returns: np.ndarray) -> dict[str, Any]:
-    return {"return_mean": float(returns.mean()), "return_std": float(returns.std()), "returns": [round(float(r), 4) for r in returns]}
+    worst_first = np.sort(returns)
+
+    def mean_of_worst(share: float) -> float:
+        return float(worst_first[: max(1, round(share * len(returns)))].mean())
+
+    return {
+        "return_mean": float(returns.mean()),
+        "return_std": float(returns.std()),
+        "return_cvar": {str(share): mean_of_worst(share) for share in (0.05, 0.1, 0.25)},
+        "return_quantiles": {str(q): float(np.quantile(returns, q)) for q in (0.05, 0.25, 0.5, 0.75, 0.95)},
+        "returns": [round(float(r), 4) for r in returns],
+    }
 
 
 def _in_jax(state: TrainState, greedy, config: Config, engine: str, episodes: int, seed: int) -> np.ndarray:

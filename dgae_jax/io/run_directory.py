@@ -11,7 +11,8 @@ from typing import Any
 
 import jax
 
-from dgae_jax.config import Config, ConfigError, from_dict, to_dict, validate
+from dgae_jax.config import Config, ConfigError, from_dict, to_dict
+from dgae_jax.validation import validate
 
 _VERSIONS_OF = ("dgae_jax", "jax", "jaxlib", "flax", "optax", "brax", "mujoco", "mujoco-mjx", "gymnasium", "numpy")
 

@@ -10,13 +10,14 @@ import jax
 import numpy as np
 
 from dgae_jax.build import make_task, make_trainer, seed_keys
-from dgae_jax.config import Config, ConfigError, resolve, validate
+from dgae_jax.config import Config, ConfigError, resolve
 from dgae_jax.envs.registry import BRAX
 from dgae_jax.io import checkpoint, metrics, plots, run_directory
 from dgae_jax.io.evaluation import evaluate_state
 from dgae_jax.io.progress import Reporter
 from dgae_jax.physics.base import PhysicsState
 from dgae_jax.types import TrainState
+from dgae_jax.validation import validate
 
 CAPACITY = 64
 """Most iterations in one dispatch."""

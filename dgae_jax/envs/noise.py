@@ -1,0 +1,51 @@
+"""Randomness for tasks that have none: deterministic MuJoCo leaves a value distribution little to model."""
+
+from typing import Any
+
+import jax
+from brax.envs.base import Env, State, Wrapper
+from jaxtyping import Array
+
+from dgae_jax.envs.task import Task
+
+
+class Noisy(Wrapper):
+    """A task with normal noise of given deviations, drawn afresh at every step from the key of its reset.
+
+    The policy sees and the reward is paid with noise; the physics underneath stays exact. `initial` moves positions and
+    velocities at a reset, for our own tasks.
+    """
+
+    def __init__(self, env: Env, *, reward: float = 0.0, action: float = 0.0, observation: float = 0.0, initial: float = 0.0):
+        super().__init__(env)
+        if initial and not isinstance(env, Task):
+            raise ValueError("noise on the initial state is for our own tasks")
+        self._reward, self._action, self._observation, self._initial = reward, action, observation, initial
+
+    @property
+    def action_range(self) -> tuple[Array, Array]:
+        """That of the task."""
+        return self.env.action_range
+
+    def reset(self, rng: Array) -> State:
+        """The task's own start, moved and seen with noise."""
+        key, q_key, v_key, o_key, r_key = jax.random.split(rng, 5)
+        state = self.env.reset(r_key)
+        if self._initial:
+            physics: Any = state.pipeline_state
+            moved = (x + self._initial * jax.random.normal(k, x.shape) for k, x in ((q_key, physics.qpos), (v_key, physics.qvel)))
+            state = self.env.set_state(state, *moved)
+        return self._seen(state, o_key, key)
+
+    def step(self, state: State, action: Array) -> State:
+        """One step of the task, from its true observation."""
+        key, a_key, r_key, o_key = jax.random.split(state.info["noise_key"], 4)
+        action = action + self._action * jax.random.normal(a_key, action.shape)
+        after = self.env.step(state.replace(obs=state.info["true_obs"]), action)
+        after = after.replace(reward=after.reward + self._reward * jax.random.normal(r_key))
+        return self._seen(after, o_key, key)
+
+    def _seen(self, state: State, key: Array, rest: Array) -> State:
+        true: Any = state.obs
+        obs = true + self._observation * jax.random.normal(key, true.shape)
+        return state.replace(obs=obs, info={**state.info, "true_obs": true, "noise_key": rest})
