@@ -27,16 +27,36 @@ def _traced(*names: str):
     return register
 
 
-@_traced("learning_rate", "learning_rate_end", "max_grad_norm", "clip", "initial_std", "radius", "damping")
 @dataclass(frozen=True)
-class PolicyConfig:
+class FitConfig:
+    """A network and the gradient steps on it."""
+
+    hidden: tuple[int, ...] = (64, 64)
+    """Width of each hidden layer [units]."""
+    optimizer: str = "adam"
+    """adam or rmsprop."""
+    learning_rate: float = 3e-4
+    """Learning rate at the start [1]."""
+    learning_rate_end: float = 0.0
+    """Learning rate at the end of the run as a fraction of its start: 1 constant, 0 linear decay to zero [1]."""
+    epochs: int = 10
+    """Passes over each rollout [1]."""
+    minibatches: int = 32
+    """Gradient steps per pass; must divide num_envs * horizon [1]."""
+    max_grad_norm: float = 0.5
+    """Largest global norm of a gradient [1]."""
+
+
+_FIT = ("learning_rate", "learning_rate_end", "max_grad_norm")
+
+
+@_traced(*_FIT, "clip", "initial_std", "radius", "damping")
+@dataclass(frozen=True)
+class PolicyConfig(FitConfig):
     """The policy network and how it improves."""
 
     update: str = "default"
     """clip (PPO), gradient (A2C) or trust-region (TRPO); default: the algorithm's own."""
-
-    hidden: tuple[int, ...] = (64, 64)
-    """Width of each hidden layer [units]."""
     covariance: str = "shared"
     """Where the actions' deviation comes from: shared (one learned vector) or state (an output of the network)."""
     initial_std: float = 0.5
@@ -53,48 +73,21 @@ class PolicyConfig:
     """Trust region: times a step is halved before it is given up [1]."""
     fisher_every: int = 1
     """Trust region: the Fisher matrix is taken over every n-th sample [samples]."""
-    optimizer: str = "adam"
-    """adam or rmsprop."""
-    learning_rate: float = 3e-4
-    """Learning rate at the start [1]."""
-    learning_rate_end: float = 0.0
-    """Learning rate at the end of the run as a fraction of its start: 1 constant, 0 linear decay to zero [1]."""
-    epochs: int = 10
-    """Passes over each rollout [1]."""
-    minibatches: int = 32
-    """Gradient steps per pass; must divide num_envs * horizon [1]."""
-    max_grad_norm: float = 0.5
-    """Largest global norm of a gradient [1]."""
 
 
-@_traced("learning_rate", "learning_rate_end", "max_grad_norm", "kappa")
+@_traced(*_FIT, "kappa")
 @dataclass(frozen=True)
-class CriticConfig:
+class CriticConfig(FitConfig):
     """The value network and what it is fitted to."""
 
     kind: str = "default"
     """scalar (one value) or quantile (a distribution); default: the algorithm's own."""
-
-    hidden: tuple[int, ...] = (64, 64)
-    """Width of each hidden layer [units]."""
     target: str = "default"
     """bellman, bellman-frozen, lambda-shift, sr-lambda or lambda-return; default: the algorithm's own."""
     quantiles: int = 64
     """Quantiles K of a distributional critic [1]."""
     kappa: float = 1.0
     """Threshold of the quantile-Huber loss of a distributional critic [units of the scaled return]."""
-    optimizer: str = "adam"
-    """adam or rmsprop."""
-    learning_rate: float = 3e-4
-    """Learning rate at the start [1]."""
-    learning_rate_end: float = 0.0
-    """Learning rate at the end of the run as a fraction of its start: 1 constant, 0 linear decay to zero [1]."""
-    epochs: int = 10
-    """Passes over each rollout [1]."""
-    minibatches: int = 32
-    """Gradient steps per pass; must divide num_envs * horizon [1]."""
-    max_grad_norm: float = 0.5
-    """Largest global norm of a gradient [1]."""
 
 
 @dataclass(frozen=True)
