@@ -177,7 +177,7 @@ def policy_of(run_dir: Path) -> tuple[str, Callable[[np.ndarray], np.ndarray]]:
     """The task of a run and its mean action."""
     config = dataclasses.replace(run_directory.read_config(run_dir), physics="native")
     with jax.enable_x64(False):  # policies are float32
-        state = jax.tree.map(lambda x: x[0], checkpoint.load(checkpoint.latest(run_dir), config))
+        state = jax.tree.map(lambda x: x[0], checkpoint.newest(run_dir, config)[0])
         greedy = jax.jit(make_greedy(make_task(config), config))
 
     def act(obs: np.ndarray) -> np.ndarray:

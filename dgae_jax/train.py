@@ -1,6 +1,7 @@
 """One training iteration as one pure function: roll out, estimate advantages, improve the policy, fit the critic."""
 
 from collections.abc import Callable
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -46,6 +47,7 @@ def make_train(
             episodes=start(env, env_key, num_envs),
             key=key,
             iteration=jnp.int32(0),
+            failures=jnp.int32(0),
         )
 
     @jax.default_matmul_precision("highest")  # TF32 ruins training on GPUs that default to it
@@ -59,17 +61,26 @@ def make_train(
         batch, estimates = _estimate(algorithm, state, step, reward, target_key, gamma, lam, diagnose)
         policy, improved = algorithm.improve.step(policy_key, state.policy, batch)
         critic, evaluated = algorithm.evaluate.step(critic_key, state.critic, batch)
+        sound = _finite((policy, critic, improved["loss"], evaluated["loss"]))
+        policy, critic = jax.tree.map(lambda new, old: jnp.where(sound, new, old), (policy, critic), (state.policy, state.critic))
         observations = normalizers.observe(state.observations, step.obs) if normalize_observations else state.observations
         metrics = {
             **_account(episodes, step),
             "nonfinite": episodes.nonfinite - state.episodes.nonfinite,
+            "skipped": 1.0 - sound,
             **{f"policy/{name}": value for name, value in improved.items()},
             **{f"critic/{name}": value for name, value in evaluated.items()},
             **estimates,
         }
-        return TrainState(policy, critic, observations, returns, episodes, key, state.iteration + 1), metrics
+        failures = jnp.where(sound, 0, state.failures + 1)
+        return TrainState(policy, critic, observations, returns, episodes, key, state.iteration + 1, failures), metrics
 
     return init, train_step
+
+
+def _finite(tree: Any) -> Array:
+    """Whether every number is finite."""
+    return jnp.stack([jnp.isfinite(x).all() for x in jax.tree.leaves(tree)]).all()
 
 
 def _acting(algorithm: Algorithm, state: TrainState) -> Act:

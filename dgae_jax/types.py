@@ -60,6 +60,8 @@ class TrainState(NamedTuple):
     """The worlds and the bookkeeping of their episodes."""
     key: Key[Array, ""]
     iteration: Int[Array, ""]
+    failures: Int[Array, ""]
+    """Iterations in a row whose update was not finite and was left out."""
 
 
 class Policy(NamedTuple):

@@ -7,7 +7,7 @@ from typing import Any
 import brax.envs
 
 from dgae_jax.algorithms import TABLE
-from dgae_jax.config import Config, ConfigError, PolicyConfig, resolve
+from dgae_jax.config import Config, ConfigError, PolicyConfig, flag, resolve
 from dgae_jax.critics import CRITICS, RESIDUALS, TARGETS
 from dgae_jax.distortion import weights_of
 from dgae_jax.envs.registry import BRAX, PHYSICS, TASKS, VERSIONS
@@ -17,11 +17,6 @@ from dgae_jax.updates import OPTIMIZERS, UPDATES
 LARGEST_BUDGET = 2**31 - 1
 
 _PARTS = (("policy", "update", UPDATES), ("critic", "kind", CRITICS), ("critic", "target", TARGETS))
-
-
-def flag(path: str) -> str:
-    """The command-line spelling of a field."""
-    return "--" + path.replace("_", "-")
 
 
 def _check(path: str, value: Any, ok: bool, allowed: str) -> None:

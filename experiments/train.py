@@ -2,14 +2,15 @@
 
 import sys
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Annotated
 
 import tyro
 
-from dgae_jax import Config, ConfigError
-from dgae_jax.io import cli
-from dgae_jax.io.training import RunOptions, train
-from dgae_jax.presets import preset
+from dgae_jax import Config, ConfigError, presets
+from dgae_jax.io import cli, run_directory
+from dgae_jax.io.checkpoint import CheckpointError
+from dgae_jax.io.training import RunOptions, resume, train
 
 
 @dataclass(frozen=True)
@@ -18,20 +19,30 @@ class Arguments:
 
     preset: str = "tuned"
     """Where all other settings start: tuned (ours) or paper (its set-up)."""
-    config: Annotated[Config, tyro.conf.arg(name="")] = field(default_factory=Config)
+    config: Path | None = None
+    """A config.json, of a run for example, where all other settings start instead [path]."""
+    settings: Annotated[Config, tyro.conf.arg(name="")] = field(default_factory=Config)
     run: Annotated[RunOptions, tyro.conf.arg(name="")] = field(default_factory=RunOptions)
 
 
 def main() -> int:
     """Train one run directory; 0 done, 2 bad input, 130 / 143 stopped by a signal with a checkpoint saved."""
-    chosen = cli.peek(preset="tuned", algo=Config.algo, env=Config.env, policy_update="default")
     try:
-        config = preset(chosen["preset"], chosen["algo"], chosen["env"], chosen["policy_update"])
+        config = _start(**cli.peek(preset="tuned", algo=Config.algo, env=Config.env, policy_update="default", config="", resume=""))
         description = "Train a policy on a MuJoCo task with PPO, TRPO, A2C or their distributional variants."
-        arguments = cli.parse(Arguments, description, default=Arguments(config=config))
-        return train(arguments.config, arguments.run)
-    except ConfigError as mistake:
+        arguments = cli.parse(Arguments, description, default=Arguments(settings=config))
+        return (resume if arguments.run.resume else train)(arguments.settings, arguments.run)
+    except (ConfigError, CheckpointError) as mistake:
         cli.fail(str(mistake))
+
+
+def _start(preset: str, algo: str, env: str, policy_update: str, config: str, resume: str) -> Config:
+    """Where all settings start that no flag names: a run's own, a file's, or a preset's."""
+    if resume:
+        return run_directory.read_config(Path(resume))
+    if config:
+        return run_directory.read_config_file(Path(config))
+    return presets.preset(preset, algo, env, policy_update)
 
 
 if __name__ == "__main__":

@@ -1,5 +1,7 @@
 """The whole training state in one file of plain data (msgpack): loading it runs no code."""
 
+import hashlib
+import json
 import os
 from pathlib import Path
 
@@ -12,55 +14,96 @@ from dgae_jax.build import make_task, make_trainer, seed_keys
 from dgae_jax.config import Config
 from dgae_jax.types import TrainState
 
+SCHEMA = 1
+"""Version of the file format."""
+
 
 class CheckpointError(ValueError):
-    """A checkpoint that is missing, damaged or of another run; the message names the file and the reason."""
+    """A checkpoint that is missing or of another run or version; the message names the file and the reason."""
+
+
+class DamagedError(CheckpointError):
+    """A checkpoint whose bytes are not what was written; an older one may be whole."""
 
 
 def save(directory: Path, state: TrainState, steps: int, keep: int = 3) -> Path:
-    """Write `steps_….msgpack`, complete or not at all, and delete all but the newest `keep`."""
+    """Write `steps_….msgpack`, complete or not at all, and delete all but the newest `keep`.
+
+    The file is one line of JSON, with schema and checksum, and the arrays in msgpack.
+    """
     path = directory / f"steps_{steps:012d}.msgpack"
     part = path.with_suffix(".part")
+    arrays = serialization.msgpack_serialize(jax.tree.map(np.asarray, _plain(state)))
+    header = {"schema": SCHEMA, "sha256": hashlib.sha256(arrays).hexdigest()}
     with part.open("wb") as file:
-        file.write(serialization.msgpack_serialize(jax.tree.map(np.asarray, _plain(state))))
+        file.write(json.dumps(header).encode() + b"\n" + arrays)
         file.flush()
         os.fsync(file.fileno())
     part.replace(path)
-    for old in sorted(directory.glob("steps_*.msgpack"))[:-keep]:
+    for old in _found(directory)[:-keep]:
         old.unlink()
     return path
 
 
-def latest(run_dir: Path) -> Path:
-    """The newest checkpoint of a run; raises CheckpointError if there is none."""
-    found = sorted((run_dir / "checkpoints").glob("steps_*.msgpack"))
-    if not found:
-        raise CheckpointError(f"{run_dir}: must hold a checkpoint; checkpoints/ has none")
-    return found[-1]
+def _found(directory: Path) -> list[Path]:
+    return sorted(p for p in directory.glob("steps_*.msgpack") if p.is_file() and not p.is_symlink())
+
+
+def newest(run_dir: Path, config: Config) -> tuple[TrainState, Path, list[str]]:
+    """The state of the newest checkpoint that is whole, its file, and what was wrong with newer ones.
+
+    Raises CheckpointError if there is none.
+    """
+    wrong = []
+    for path in reversed(_found(run_dir / "checkpoints")):
+        try:
+            return load(path, config), path, wrong
+        except DamagedError as reason:
+            wrong.append(str(reason))
+    raise CheckpointError("; ".join(wrong) or f"{run_dir}: must hold a checkpoint; checkpoints/ has none")
 
 
 def load(path: Path, config: Config) -> TrainState:
-    """The state saved at `path` by a run of `config`; raises CheckpointError if it is damaged or does not fit."""
+    """The state saved at `path` by a run of `config`.
+
+    Raises DamagedError if the file cannot be read whole, CheckpointError if it is of another run or a newer version.
+    """
+    got = _read(path)
     blank = jax.eval_shape(make_trainer(make_task(config), 1).init, config, seed_keys(config))
     want = jax.eval_shape(_plain, blank)
-    try:
-        got = serialization.msgpack_restore(path.read_bytes())
-        names = set(map(str, got.keys()))
-    except OSError as reason:
-        raise CheckpointError(f"{path}: cannot be read ({reason.strerror})") from reason
-    except Exception as reason:  # the decoder raises many kinds for damaged bytes
-        raise CheckpointError(f"{path}: is damaged ({type(reason).__name__})") from reason
-    for name in sorted(names ^ set(want)):
-        raise CheckpointError(f"{path}: is of another run, {name} is {'unknown here' if name in names else 'missing'}")
+    for name in sorted(set(got) ^ set(want)):
+        raise CheckpointError(f"{path}: is of another run, {name} is {'unknown here' if name in got else 'missing'}")
     for name, like in want.items():
-        if np.shape(got[name]) != like.shape or np.asarray(got[name]).dtype != like.dtype:
-            raise CheckpointError(f"{path}: is of another run, {name} is {np.shape(got[name])}, here {like.shape}")
+        found = f"{got[name].dtype}{got[name].shape}"
+        if found != f"{like.dtype}{like.shape}":
+            raise CheckpointError(f"{path}: is of another run, {name} is {found}, here {like.dtype}{like.shape}")
 
     def restored(path, like):
         leaf = jnp.asarray(got[_name(path)])
         return jax.random.wrap_key_data(leaf) if _is_key(like) else leaf
 
     return jax.tree.map_with_path(restored, blank)
+
+
+def _read(path: Path) -> dict[str, np.ndarray]:
+    """The arrays by name. Nothing in the file is ever run, and only bytes that match their checksum are decoded."""
+    try:
+        first, _, arrays = path.read_bytes().partition(b"\n")
+    except OSError as reason:
+        raise DamagedError(f"{path}: cannot be read ({reason.strerror})") from reason
+    try:
+        header = json.loads(first)
+        schema, checksum = int(header["schema"]), str(header["sha256"])
+    except (ValueError, TypeError, KeyError, RecursionError):
+        raise DamagedError(f"{path}: is damaged (no header)") from None
+    if schema != SCHEMA:
+        raise CheckpointError(f"{path}: has schema {schema}; this version reads schema {SCHEMA}")
+    if hashlib.sha256(arrays).hexdigest() != checksum:
+        raise DamagedError(f"{path}: is damaged (its checksum differs)")
+    try:
+        return {str(name): np.asarray(array) for name, array in serialization.msgpack_restore(arrays).items()}
+    except Exception as reason:  # a hostile file may carry a valid checksum; the decoder raises many kinds
+        raise DamagedError(f"{path}: is damaged ({type(reason).__name__})") from reason
 
 
 def _is_key(x) -> bool:

@@ -37,8 +37,7 @@ def evaluate_state(state: TrainState, config: Config, *, engine: str, episodes: 
 
 def evaluate_run(run_dir: Path, config: Config, *, engine: str, episodes: int, seed: int = 0) -> dict[str, Any]:
     """`evaluate_state` for the newest checkpoint of a run."""
-    newest = checkpoint.latest(run_dir)
-    state = checkpoint.load(newest, config)
+    state, newest, _ = checkpoint.newest(run_dir, config)
     return {**evaluate_state(state, config, engine=engine, episodes=episodes, seed=seed), "checkpoint": newest.name}
 
 

@@ -1,11 +1,14 @@
 """The directory of a run: `config.json`, `manifest.json`, `metrics.jsonl`, `checkpoints/`, `curve.png`, `evaluation.json`."""
 
+import contextlib
+import fcntl
 import importlib.metadata
 import json
 import platform
 import subprocess
 import sys
 import time
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -37,16 +40,34 @@ def create(path: Path, config: Config) -> None:
         raise ConfigError(f"--run-dir {path}: must be a directory that can be written ({reason.strerror})") from reason
 
 
+@contextlib.contextmanager
+def locked(path: Path) -> Iterator[None]:
+    """Hold the run directory; raises ConfigError if another process does. The lock ends with the process."""
+    with (path / "config.json").open() as file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError:
+            raise ConfigError(f"{path}: must not be in use; another process is training there") from None
+        yield
+
+
 def read_config(path: Path) -> Config:
     """The configuration of a run; raises ConfigError if `path` is not a run directory."""
+    if not (path / "config.json").is_file():
+        raise ConfigError(f"{path}: must be a run directory with a config.json")
+    return read_config_file(path / "config.json")
+
+
+def read_config_file(path: Path) -> Config:
+    """A configuration as JSON; raises ConfigError if it cannot be read or cannot be."""
     try:
-        config = from_dict(json.loads((path / "config.json").read_text()))
+        config = from_dict(json.loads(path.read_text()))
         validate(config)
         return config
     except OSError as reason:
-        raise ConfigError(f"{path}: must be a run directory with a config.json ({reason.strerror})") from reason
-    except ValueError as reason:
-        raise ConfigError(f"{path / 'config.json'}: {reason}") from reason
+        raise ConfigError(f"{path}: must be a file that can be read ({reason.strerror})") from reason
+    except (ValueError, RecursionError) as reason:
+        raise ConfigError(f"{path}: {reason}") from reason
 
 
 def write_json(path: Path, data: Any) -> None:

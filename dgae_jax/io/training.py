@@ -1,6 +1,6 @@
 """A run from its configuration to its evaluation, on disk."""
 
-import signal
+import sys
 import time
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,11 +10,12 @@ import jax
 import numpy as np
 
 from dgae_jax.build import make_task, make_trainer, seed_keys
-from dgae_jax.config import Config, ConfigError, resolve
+from dgae_jax.config import Config, ConfigError, differences, flag, resolve, to_dict
 from dgae_jax.envs.registry import BRAX
 from dgae_jax.io import checkpoint, metrics, plots, run_directory
 from dgae_jax.io.evaluation import evaluate_state
 from dgae_jax.io.progress import Reporter
+from dgae_jax.io.signals import Signals
 from dgae_jax.physics.base import PhysicsState
 from dgae_jax.types import TrainState
 from dgae_jax.validation import validate
@@ -35,6 +36,12 @@ class RunOptions:
     """Where compiled programs are kept between runs (JAX keeps those of mjx, not of native); none disables [path]."""
     checkpoint_every: int = 200_000
     """Samples of each run between checkpoints; one is always saved at the end [environment steps]."""
+    resume: Path | None = None
+    """Continue the run in this directory, bit for bit; other flags may be left out [path]."""
+    other_physics: bool = False
+    """Let --resume continue with another --physics: the same in the statistical sense only."""
+    max_nonfinite: int = 10
+    """Updates in a row that may turn out non-finite, and be left out, before the run is stopped [iterations]."""
     episodes: int = 20
     """Episodes of the final evaluation in Gymnasium, per run [episodes]."""
     debug_nonfinite: bool = False
@@ -43,15 +50,17 @@ class RunOptions:
 
 def validate_options(options: RunOptions) -> None:
     """Raise `ConfigError` for the first option that cannot be."""
-    for flag, value in (("--checkpoint-every", options.checkpoint_every), ("--episodes", options.episodes)):
+    for name in ("checkpoint_every", "episodes", "max_nonfinite"):
+        value = getattr(options, name)
         if value < 1:
-            raise ConfigError(f"{flag} {value}: must be a whole number of at least 1")
+            raise ConfigError(f"{flag(name)} {value}: must be a whole number of at least 1")
 
 
 def train(config: Config, options: RunOptions) -> int:
-    """Train, evaluate, and write the run directory; the process's exit code: 0, or 130 / 143 after a signal.
+    """Train, evaluate, and write the run directory.
 
-    Raises ConfigError before anything is written or compiled if the configuration or a path cannot be.
+    Returns the process's exit code: 0, 1 if training broke down, or 130 / 143 after a signal. Raises ConfigError before
+    anything is written or compiled if the configuration or a path cannot be.
     """
     validate(config)
     validate_options(options)
@@ -59,15 +68,66 @@ def train(config: Config, options: RunOptions) -> int:
     run_dir = options.run_dir or run_directory.default_path(config)
     use_cache(options.cache_dir)
     run_directory.create(run_dir, config)
+    with run_directory.locked(run_dir):
+        return _run(config, options, run_dir, None)
+
+
+def resume(config: Config, options: RunOptions) -> int:
+    """Continue the run in `options.resume` from its newest whole checkpoint, as if it had never stopped.
+
+    Returns as `train`. Raises ConfigError, naming both values, for a setting other than `total_steps` that differs from the
+    run's, CheckpointError if no checkpoint can be loaded.
+    """
+    validate(config)
+    validate_options(options)
+    run_dir, config = options.resume, resolve(config)
+    assert run_dir is not None
+    if options.run_dir is not None:
+        raise ConfigError(f"--run-dir {options.run_dir}: must be left out: --resume writes to {run_dir}")
+    saved = run_directory.read_config(run_dir)
+    allowed = {"total_steps"} | ({"physics"} if options.other_physics else set())
+    for path, (ours, theirs) in differences(config, saved).items():
+        if path not in allowed:
+            raise ConfigError(f"{flag(path)} {ours}: must be {theirs} as in {run_dir}, or left out")
+    if config.physics != saved.physics:
+        print(f"from {saved.physics} to {config.physics}: steps differ by up to 1e-4, so this is not the run that would have been")
+    use_cache(options.cache_dir)
+    with run_directory.locked(run_dir):
+        state = _last_state(run_dir, config)
+        run_directory.write_json(run_dir / "config.json", to_dict(config))
+        return _run(config, options, run_dir, state)
+
+
+def _last_state(run_dir: Path, config: Config) -> TrainState | None:
+    """From the newest whole checkpoint; None if the run stopped before its first."""
+    if not any((run_dir / "checkpoints").glob("*.msgpack")):
+        print(f"{run_dir} has no checkpoint yet: it starts again")
+        return None
+    state, path, wrong = checkpoint.newest(run_dir, config)
+    for reason in wrong:
+        print(f"{reason}; falling back", file=sys.stderr)
+    print(f"resuming from {path.name}")
+    return state
+
+
+def _run(config: Config, options: RunOptions, run_dir: Path, state: TrainState | None) -> int:
     print(_budget(config))
     if config.physics == "mjx" and jax.default_backend() == "cpu" and not config.env.startswith(BRAX):
         print("no accelerator: --physics native starts and runs faster here")
-    with _Signals() as signals:
-        state = _iterate(config, options, run_dir, signals)
+    with Signals() as signals:
+        state = _iterate(config, options, run_dir, signals, state)
+    if _broken(state, options):
+        reason = f"the last {int(state.failures.max())} updates were not finite and were left out"
+        print(f"stopped: {reason}; the state before them is in {run_dir}", file=sys.stderr)
+        return 1
     if signals.received:
-        print(f"stopped by {signals.received.name}; checkpoint saved in {run_dir}", flush=True)
+        print(f"stopped by {signals.received.name}; continue with --resume {run_dir}", flush=True)
         return 128 + signals.received
     return _evaluate(state, config, options.episodes, run_dir)
+
+
+def _broken(state: TrainState, options: RunOptions) -> bool:
+    return int(state.failures.max()) >= options.max_nonfinite
 
 
 def use_cache(cache_dir: str) -> None:
@@ -89,36 +149,40 @@ def _budget(config: Config) -> str:
     return f"{config.env}-{config.env_version} {config.algo} on {config.physics}: {used} of {config.total_steps:,} steps{runs}"
 
 
-def _iterate(config: Config, options: RunOptions, run_dir: Path, signals: "_Signals") -> TrainState:
-    """All iterations, dispatch by dispatch, until the budget is used or a signal came."""
+def _iterate(config: Config, options: RunOptions, run_dir: Path, signals: Signals, state: TrainState | None) -> TrainState:
+    """All iterations that are left, dispatch by dispatch, until the budget is used or a signal came."""
     trainer = make_trainer(make_task(config), CAPACITY)
-    file = metrics.MetricsFile(run_dir / "metrics.jsonl", config.seed, config.samples)
+    done = 0 if state is None else int(state.iteration[0])
+    file = metrics.MetricsFile(run_dir / "metrics.jsonl", config, done)
     every = max(1, options.checkpoint_every // config.samples)
-    began, done, count, rows = time.monotonic(), 0, 1, []
+    began, count, first = time.monotonic() - file.seconds, 1, True
     reporter = Reporter(config.iterations * config.samples, config.num_seeds)
     try:
-        state = trainer.init(config, seed_keys(config))
-        while done == 0 or (done < config.iterations and not signals.received):  # a signal while compiling still gets its checkpoint
+        state = trainer.init(config, seed_keys(config)) if state is None else state
+        while done < config.iterations and (first or not signals.received):  # a signal while compiling still gets its checkpoint
             count = min(count, config.iterations - done, every - done % every)
             since = time.monotonic()
             state, measured = trainer.dispatch(config, state, count)
             new = file.append(measured, count, time.monotonic() - began)
             if options.debug_nonfinite:
                 _save_incidents(state, new, run_dir / "nonfinite")
-            seconds, first = (time.monotonic() - since) / count, done == 0
-            rows, done = rows + new, done + count
-            returns = [row["episode_return"] for row in new[-config.num_seeds :] if row["episode_return"] is not None]
-            mean = float(np.mean(returns)) if returns else None
-            if first:  # it also compiled, so it says nothing about speed
-                count = 1
-            else:
-                reporter.update(done * config.samples, config.samples / seconds, mean)
-                count = int(np.clip(DISPATCH_SECONDS / seconds, 1, CAPACITY))
-            if done % every == 0 or done == config.iterations or signals.received:
-                _save(state, rows, config, run_dir, done * config.samples)
+            seconds, done = (time.monotonic() - since) / count, done + count
+            if not first:  # the first also compiled, so it says nothing about speed
+                reporter.update(done * config.samples, config.samples / seconds, _mean_return(new, config))
+            count = 1 if first else int(np.clip(DISPATCH_SECONDS / seconds, 1, CAPACITY))
+            first, broken = False, _broken(state, options)
+            if done % every == 0 or done == config.iterations or signals.received or broken:
+                _save(state, file.rows, config, run_dir, done * config.samples)
+            if broken:
+                break
     finally:
         reporter.close()
     return state
+
+
+def _mean_return(rows: list[dict[str, Any]], config: Config) -> float | None:
+    returns = [row["episode_return"] for row in rows[-config.num_seeds :] if row["episode_return"] is not None]
+    return float(np.mean(returns)) if returns else None
 
 
 def _save(state: TrainState, rows: list[dict[str, Any]], config: Config, run_dir: Path, steps: int) -> None:
@@ -151,24 +215,3 @@ def describe(result: dict[str, Any]) -> str:
         f"return {result['return_mean']:,.1f} ± {result['return_std']:,.1f} over {result['episodes']} episodes"
         f" of the deterministic policy in {result['env']} ({result['engine']})"
     )
-
-
-class _Signals:
-    """Notes the first SIGINT or SIGTERM, so that the running dispatch can finish; a second one acts at once."""
-
-    def __init__(self):
-        self.received: signal.Signals | None = None
-        self.before: dict[signal.Signals, Any] = {}
-
-    def __enter__(self) -> "_Signals":
-        self.before = {kind: signal.signal(kind, self._note) for kind in (signal.SIGINT, signal.SIGTERM)}
-        return self
-
-    def __exit__(self, *_) -> None:
-        for kind, handler in self.before.items():
-            signal.signal(kind, handler)
-
-    def _note(self, kind: int, _) -> None:
-        self.received = signal.Signals(kind)
-        for each in self.before:
-            signal.signal(each, signal.SIG_DFL)
