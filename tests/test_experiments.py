@@ -198,7 +198,7 @@ def test_a_signal_saves_a_checkpoint_and_ends_with_its_code(kind, code, tmp_path
     process.send_signal(kind)
     out, _ = process.communicate(timeout=60)
     assert process.returncode == code
-    assert f"stopped by {kind.name}; checkpoint saved in" in out
+    assert f"stopped by {kind.name}; continue with --resume" in out
     steps = metrics.read(lines)[-1]["steps"]
     assert (tmp_path / "run" / "checkpoints" / f"steps_{steps:012d}.msgpack").exists()
 

@@ -1,4 +1,5 @@
 import dataclasses
+import hashlib
 import json
 import math
 
@@ -27,6 +28,11 @@ def plain(state):
     return jax.device_get(state._replace(key=jax.random.key_data(state.key)))
 
 
+def signed(arrays):
+    """Any bytes with the header of a checkpoint."""
+    return json.dumps({"schema": checkpoint.SCHEMA, "sha256": hashlib.sha256(arrays).hexdigest()}).encode() + b"\n" + arrays
+
+
 def test_a_checkpoint_gives_the_state_back_bit_for_bit(state, tmp_path):
     loaded = checkpoint.load(checkpoint.save(tmp_path, state, 64), SMALL)
     chex.assert_trees_all_equal(plain(loaded), plain(state))
@@ -38,7 +44,7 @@ def test_only_the_newest_checkpoints_are_kept(state, tmp_path):
     for steps in (64, 9_000, 128, 10_000):
         checkpoint.save(tmp_path / "checkpoints", state, steps, keep=2)
     assert sorted(p.name for p in (tmp_path / "checkpoints").iterdir()) == ["steps_000000009000.msgpack", "steps_000000010000.msgpack"]
-    assert checkpoint.latest(tmp_path).name == "steps_000000010000.msgpack"
+    assert checkpoint.newest(tmp_path, SMALL)[1].name == "steps_000000010000.msgpack"
 
 
 @pytest.mark.parametrize(
@@ -49,7 +55,11 @@ def test_only_the_newest_checkpoints_are_kept(state, tmp_path):
         (lambda b: b"\x00" * 50, "is damaged"),
         (lambda b: b"\xa3abc", "is damaged"),
         (lambda b: b"\x93\x01\xa1a\x02", "is damaged"),
-        (lambda b: b.replace(b"critic", b"cretic"), "is of another run, cretic.* is unknown here"),
+        (lambda b: b[:-9] + b"x" + b[-8:], "is damaged"),
+        (lambda b: b.replace(b'"schema": 1', b'"schema": 2'), "has schema 2; this version reads schema 1"),
+        (lambda b: signed(b.partition(b"\n")[2].replace(b"critic", b"cretic")), "is of another run, cretic.* is unknown here"),
+        (lambda b: signed(b"\x93\x01\xa1a\x02"), "is damaged"),
+        (lambda b: signed(b"\x81\xa1a\xc1"), "is damaged"),
     ],
 )
 def test_a_damaged_checkpoint_is_refused_by_name(damage, reason, state, tmp_path):
@@ -62,17 +72,33 @@ def test_a_damaged_checkpoint_is_refused_by_name(damage, reason, state, tmp_path
 def test_a_checkpoint_of_another_network_size_is_refused_by_leaf_and_shapes(state, tmp_path):
     path = checkpoint.save(tmp_path, state, 64)
     wider = dataclasses.replace(SMALL, policy=dataclasses.replace(SMALL.policy, hidden=(9,)))
-    with pytest.raises(CheckpointError, match=r"is of another run, policy\..* is \(1, 8, 3\), here \(1, 9, 3\)"):
+    with pytest.raises(CheckpointError, match=r"is of another run, policy\..* is float32\(1, 8, 3\), here float32\(1, 9, 3\)"):
         checkpoint.load(path, wider)
 
 
 def test_a_directory_without_checkpoints_is_refused(tmp_path):
     with pytest.raises(CheckpointError, match="must hold a checkpoint"):
-        checkpoint.latest(tmp_path)
+        checkpoint.newest(tmp_path, SMALL)
+
+
+def test_a_damaged_checkpoint_gives_way_to_an_older_one_and_links_are_not_followed(state, tmp_path):
+    directory = tmp_path / "checkpoints"
+    directory.mkdir()
+    whole, broken = (checkpoint.save(directory, state, steps) for steps in (64, 128))
+    broken.write_bytes(broken.read_bytes()[:-1])
+    (directory / "steps_000000000192.msgpack").symlink_to(whole)
+    _, path, wrong = checkpoint.newest(tmp_path, SMALL)
+    assert path == whole
+    assert len(wrong) == 1
+    assert "its checksum differs" in wrong[0]
+    whole.unlink()
+    with pytest.raises(CheckpointError, match="its checksum differs"):
+        checkpoint.newest(tmp_path, SMALL)
 
 
 def test_metrics_are_one_json_object_per_run_and_iteration(tmp_path):
-    file = metrics.MetricsFile(tmp_path / "metrics.jsonl", first_seed=7, samples=100)
+    config = dg.Config(seed=7, num_seeds=2, num_envs=10, horizon=10)
+    file = metrics.MetricsFile(tmp_path / "metrics.jsonl", config, 0)
     columns = {"episode_return": np.array([[1.5, np.nan], [2.0, 3.0], [0, 0]]), "episodes": np.array([[0, 1], [2, 3], [0, 0]])}
     file.append(columns, 2, 1.0)
     file.append(columns, 1, 2.0)
@@ -81,6 +107,19 @@ def test_metrics_are_one_json_object_per_run_and_iteration(tmp_path):
         (1, 100, 7, 1.5, 0), (1, 100, 8, None, 1), (2, 200, 7, 2, 2), (2, 200, 8, 3, 3), (3, 300, 7, 1.5, 0), (3, 300, 8, None, 1),
     ]  # fmt: skip
     assert "NaN" not in (tmp_path / "metrics.jsonl").read_text()
+
+
+def test_metrics_continue_behind_the_checkpoint_whatever_followed_it(tmp_path):
+    config, path = dg.Config(num_envs=10, horizon=10), tmp_path / "metrics.jsonl"
+    columns = {"reward": np.arange(8.0)[:, None]}
+    metrics.MetricsFile(path, config, 0).append(columns, 8, 1.5)
+    path.write_text(path.read_text() + '{"iteration": 9, "st')  # torn
+    file = metrics.MetricsFile(path, config, 5)
+    assert file.seconds == 1.5
+    file.append(columns, 2, 2.0)
+    assert [row["iteration"] for row in metrics.read(path)] == [1, 2, 3, 4, 5, 6, 7]
+    with pytest.raises(ConfigError, match="must hold the 9 iterations"):
+        metrics.MetricsFile(path, config, 9)
 
 
 @pytest.mark.parametrize("seeds", [1, 3])

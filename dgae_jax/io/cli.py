@@ -17,7 +17,8 @@ _FRAME = re.compile(r"[╭╮╰╯│─|+]|-{3,}")
 
 def fail(message: str) -> NoReturn:
     """One line on stderr, exit code 2."""
-    print(f"error: {message}", file=sys.stderr)
+    shown = "".join(c if c.isprintable() else ascii(c)[1:-1] for c in message)  # one line, whatever was typed
+    print(f"error: {shown}", file=sys.stderr)
     raise SystemExit(2)
 
 

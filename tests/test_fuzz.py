@@ -1,0 +1,101 @@
+"""Hostile and broken input: one clear error of ours, never a stack trace, a hang or code that runs."""
+
+import contextlib
+import io
+import json
+
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+import dgae_jax as dg
+from dgae_jax.config import ConfigError, from_dict, to_dict
+from dgae_jax.io import checkpoint, cli, metrics
+from dgae_jax.io.checkpoint import CheckpointError
+from dgae_jax.validation import validate
+from tests.test_experiments import command
+from tests.test_io import signed
+
+many = settings(max_examples=600, deadline=None, suppress_health_check=list(HealthCheck), derandomize=True)
+PLAIN = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=8),
+    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(max_size=8), inner, max_size=3),
+    max_leaves=6,
+)
+NAMES = sorted(to_dict(dg.Config())) + sorted(to_dict(dg.Config())["policy"]) + sorted(to_dict(dg.Config())["critic"])
+FLAGS = ["--" + part + name.replace("_", "-") for name in NAMES for part in ("", "policy.", "critic.", "noise.")] + [
+    "--preset", "--config", "--run-dir", "--resume", "--episodes", "--checkpoint-every", "--max-nonfinite", "--", "-h2", "--no-diagnostics",
+]  # fmt: skip
+WORDS = st.sampled_from([*FLAGS, "ppo", "dtrpo", "hopper", "brax:ant", "brax:", "cvar:0.1", "nan", "inf", "-1", "1e400", "True"])
+
+
+@many
+@given(st.lists(WORDS | st.text(max_size=10), min_size=1, max_size=6))
+def test_any_command_line_is_understood_or_refused_in_one_line(words):
+    main, err, out = command("train"), io.StringIO(), io.StringIO()
+    module = main.__globals__
+    with pytest.MonkeyPatch.context() as patch, contextlib.redirect_stderr(err), contextlib.redirect_stdout(out):
+        patch.setattr("sys.argv", ["train.py", *words])
+        for name in ("train", "resume"):  # all but the training itself
+            patch.setitem(module, name, lambda config, options: validate(config) or 0)
+        try:
+            code = main()
+        except SystemExit as stop:
+            code = stop.code
+    assert code in (0, 2, None)
+    if code == 2:
+        lines = err.getvalue().splitlines()
+        assert len(lines) == 1, lines
+        assert lines[0].startswith("error: ")
+
+
+def changed(data, path, value):
+    copy = json.loads(json.dumps(data))
+    at = copy
+    for name in path[:-1]:
+        at = at[name]
+    at[path[-1]] = value
+    return copy
+
+
+PATHS = [(k,) for k in to_dict(dg.Config())] + [(p, k) for p in ("policy", "critic", "noise") for k in to_dict(dg.Config())[p]]
+
+
+@many
+@given(st.one_of(PLAIN, st.builds(lambda path, value: changed(to_dict(dg.Config()), path, value), st.sampled_from(PATHS), PLAIN)))
+def test_any_json_is_a_configuration_or_refused(data):
+    with contextlib.suppress(ConfigError):
+        validate(from_dict(data))
+
+
+ROWS = "".join(json.dumps({"iteration": i, "steps": 10 * i, "seed": 0, "seconds": 1.0}) + "\n" for i in range(1, 6)).encode()
+
+
+@many
+@given(st.integers(0, len(ROWS)), st.binary(max_size=30))
+def test_any_tail_of_the_metrics_is_cut_or_refused(tmp_path_factory, cut, tail):
+    path = tmp_path_factory.mktemp("metrics") / "metrics.jsonl"
+    path.write_bytes(ROWS[:cut] + tail)
+    try:
+        file = metrics.MetricsFile(path, dg.Config(), 3)
+    except ConfigError:
+        return
+    assert [row["iteration"] for row in metrics.read(path)] == [1, 2, 3]
+    assert file.seconds == 1.0
+
+
+ARRAYS = b"\x82\xa1a\xc7\x0e\x01\x93\x91\x02\xa7float32\xc4\x08" + bytes(8) + b"\xa1b\xc3"
+
+
+@many
+@given(st.booleans(), st.integers(0, 200), st.binary(max_size=60), st.integers(0, 200))
+def test_any_bytes_are_a_checkpoint_or_refused_whether_they_carry_a_checksum_or_not(tmp_path_factory, honest, at, noise, rest):
+    path = tmp_path_factory.mktemp("checkpoints") / "steps_000000000001.msgpack"
+    arrays = ARRAYS[:at] + noise + ARRAYS[rest:]
+    path.write_bytes(signed(arrays) if honest else (signed(ARRAYS)[:at] + noise + signed(ARRAYS)[rest:]))
+    with contextlib.suppress(CheckpointError):
+        checkpoint._read(path)
+
+
+def test_the_command_line_parser_is_the_one_that_is_fuzzed():
+    assert command("train").__globals__["cli"] is cli
