@@ -104,11 +104,16 @@ def test_floats_of_the_configuration_may_be_swept_in_one_program():
     assert 10 * slow < fast
 
 
-def test_a_seed_trained_beside_others_starts_from_the_same_state_as_alone():
+def test_a_seed_trained_beside_others_is_the_run_alone_up_to_rounding():
+    # bit for bit at the start; then a batched matrix product may round differently from a single one
     config, trainer = hopper("ppo")
-    three = dataclasses.replace(config, num_seeds=3, seed=5)
-    beside = jax.tree.map(lambda x: x[1:2], fresh(trainer, three))
-    assert_same_bits(beside, fresh(trainer, dataclasses.replace(config, seed=6)))
+    three, alone = dataclasses.replace(config, num_seeds=3, seed=5), dataclasses.replace(config, seed=6)
+    beside, single = fresh(trainer, three), fresh(trainer, alone)
+    assert_same_bits(jax.tree.map(lambda x: x[1:2], beside), single)
+    beside, _ = trainer.dispatch(three, beside, 2)
+    single, _ = trainer.dispatch(alone, single, 2)
+    for ours, theirs in zip(jax.tree.leaves(beside.policy.params), jax.tree.leaves(single.policy.params), strict=True):
+        assert_allclose(ours[1], theirs[0], atol=1e-5)
 
 
 ALL = ["ppo", "dppo", "trpo", "dtrpo", "a2c", "da2c"]
