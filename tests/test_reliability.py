@@ -129,7 +129,7 @@ def start(run_dir, *more):
     else:
         argv = ["--run-dir", str(run_dir), "--total-steps", str(40 * 64), *TINY]
     argv += ["--checkpoint-every", str(5 * 64), "--episodes", "1", *more]
-    return subprocess.Popen([sys.executable, "experiments/train.py", *argv], cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.STDOUT)
+    return subprocess.Popen([sys.executable, "experiments/train.py", *argv], cwd=ROOT, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
 
 
 @slow
