@@ -4,6 +4,7 @@ from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import jax
+import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
 from dgae_jax.networks import value_network
@@ -55,7 +56,7 @@ def _critic(obs_size: int, outputs: int, hidden: Sequence[int], target: str, dis
 
     def loss(params: Params, batch: Batch):
         target = fitted_to.during(network.apply, params, batch)
-        return distance(network.apply(params, batch.obs), target).mean(), {}
+        return jnp.where(batch.sound, distance(network.apply(params, batch.obs), target), 0).mean(), {}
 
     return Critic(network.init, network.apply, fitted_to.frozen, loss)
 

@@ -8,7 +8,6 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import jax.numpy as jnp
-import numpy as np
 from jax.scipy.stats import norm
 from jaxtyping import Array, Float
 
@@ -51,10 +50,10 @@ def mean_cvar(k: int, alpha: float, weight: float) -> Float[Array, " K"]:
 
 METRICS = {
     "mean": Metric((), lambda: True, "", lambda k: jnp.ones(k)),
-    "cvar": Metric(("α",), lambda a: 0 < a <= 1, "0 < α ≤ 1", cvar),
-    "wang": Metric(("β",), np.isfinite, "a finite β", wang),
-    "power": Metric(("c",), lambda c: 0 < c < np.inf, "c > 0", power),
-    "mean-cvar": Metric(("α", "weight"), lambda a, w: 0 < a <= 1 and 0 <= w <= 1, "0 < α ≤ 1 and 0 ≤ weight ≤ 1", mean_cvar),
+    "cvar": Metric(("α",), lambda a: 1e-6 <= a <= 1, "1e-6 ≤ α ≤ 1", cvar),
+    "wang": Metric(("β",), lambda b: abs(b) <= 5, "−5 ≤ β ≤ 5", wang),
+    "power": Metric(("c",), lambda c: 1e-3 <= c <= 1e3, "1e-3 ≤ c ≤ 1e3", power),
+    "mean-cvar": Metric(("α", "weight"), lambda a, w: 1e-6 <= a <= 1 and 0 <= w <= 1, "1e-6 ≤ α ≤ 1 and 0 ≤ weight ≤ 1", mean_cvar),
 }
 """User preferences join here: `METRICS["mine"] = Metric((), lambda: True, "", lambda k: weights)`."""
 

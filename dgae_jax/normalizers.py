@@ -5,7 +5,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 from brax.training.acme import running_statistics
-from jaxtyping import Array, ArrayLike, Float
+from jaxtyping import Array, ArrayLike, Bool, Float
 
 OBSERVATION_LIMIT = 10.0
 """Normalised observations are clipped to ±10 deviations."""
@@ -26,9 +26,9 @@ def observations(size: int) -> Statistics:
     return running_statistics.init_state(jnp.zeros(size))
 
 
-def observe(statistics: Statistics, obs: Float[Array, "T N O"]) -> Statistics:
-    """The statistics with a rollout's observations in them, for the next iteration."""
-    return running_statistics.update(statistics, obs)
+def observe(statistics: Statistics, obs: Float[Array, "T N O"], sound: Bool[Array, "T N"]) -> Statistics:
+    """The statistics with a rollout's sound observations in them, for the next iteration."""
+    return running_statistics.update(statistics, obs, weights=sound.astype(obs.dtype))
 
 
 def normalize(statistics: Statistics, obs: Float[Array, "*batch O"]) -> Float[Array, "*batch O"]:

@@ -102,7 +102,7 @@ def rollout(
         sound = _finite((before.obs, action, log_prob, after.pipeline_state, after.reward, after.obs, after.done))
         terminated = (after.done > 0) | ~sound
         truncated = ~terminated & (episodes.steps + 1 >= episode_length)
-        step = Transition(before.obs, action, log_prob, after.reward, terminated, truncated, after.obs)  # pyright: ignore[reportArgumentType]
+        step = Transition(before.obs, action, log_prob, after.reward, terminated, truncated, after.obs, sound)  # pyright: ignore[reportArgumentType]
         step = _quarantine(step, sound)
         episodes = _record(episodes, (before.pipeline_state, action), sound)
         return _advance(episodes, after, step, start(env, reset_key, sound.shape[0])), step

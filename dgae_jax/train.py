@@ -10,7 +10,7 @@ from jaxtyping import Array, ArrayLike, Key
 
 from dgae_jax import gaussian, normalizers
 from dgae_jax.diagnostics import Diagnose, nothing
-from dgae_jax.returns import decay, lambda_sum
+from dgae_jax.returns import decay, lambda_return, lambda_sum
 from dgae_jax.rollout import Act, Episodes, rollout, start
 from dgae_jax.statistics import explained_variance
 from dgae_jax.types import Algorithm, Batch, Fit, TrainState, Transition
@@ -63,7 +63,7 @@ def make_train(
         critic, evaluated = algorithm.evaluate.step(critic_key, state.critic, batch)
         sound = _finite((policy, critic, improved["loss"], evaluated["loss"]))
         policy, critic = jax.tree.map(lambda new, old: jnp.where(sound, new, old), (policy, critic), (state.policy, state.critic))
-        observations = normalizers.observe(state.observations, step.obs) if normalize_observations else state.observations
+        observations = normalizers.observe(state.observations, step.obs, step.sound) if normalize_observations else state.observations
         metrics = {
             **_account(episodes, step),
             "nonfinite": episodes.nonfinite - state.episodes.nonfinite,
@@ -112,12 +112,13 @@ def _estimate(
     advantage = lambda_sum(residual, discount * trace)
     target = algorithm.critic.target(key, reward, discount, trace, quantiles, next_quantiles)
     standard = (advantage - advantage.mean()) / (advantage.std() + 1e-8)
-    batch = Batch(obs, step.action, step.log_prob, standard, target, reward, discount, next_obs)
+    standard = jnp.where(step.sound, standard, 0)
+    batch = Batch(obs, step.action, step.log_prob, standard, target, reward, discount, next_obs, step.sound)
     value = quantiles.mean(-1)
     going = 1.0 - (step.terminated | step.truncated)
     metrics = {
         "critic/value": value.mean(),
-        "critic/explained_variance": explained_variance(value, value + advantage),
+        "critic/explained_variance": explained_variance(value, lambda_return(reward, discount, trace, quantiles, next_quantiles)[..., 0]),
         **diagnose(reward, discount, going, quantiles, next_quantiles),
     }
     return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), batch), metrics

@@ -22,6 +22,8 @@ class Transition(NamedTuple):
     terminated: Bool[Array, "T N"]
     truncated: Bool[Array, "T N"]
     next_obs: Float[Array, "T N O"]
+    sound: Bool[Array, "T N"]
+    """False where the world turned non-finite: nothing learns from that step."""
 
 
 class Batch(NamedTuple):
@@ -38,6 +40,8 @@ class Batch(NamedTuple):
     reward: Float[Array, " B"]
     discount: Float[Array, " B"]
     next_obs: Float[Array, "B O"]
+    sound: Bool[Array, " B"]
+    """Samples that are False weigh nothing in any loss."""
 
 
 class Fit(NamedTuple):

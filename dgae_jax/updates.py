@@ -22,7 +22,7 @@ def surrogate(policy: Policy, clip: ArrayLike = jnp.inf) -> Loss:
 
     def loss(params: Params, batch: Batch):
         distribution = policy.apply(params, batch.obs)
-        log_ratio = gaussian.log_prob(distribution, batch.action) - batch.log_prob
+        log_ratio = jnp.where(batch.sound, gaussian.log_prob(distribution, batch.action) - batch.log_prob, 0)
         ratio = jnp.exp(log_ratio)
         clipped = jnp.clip(ratio, jnp.subtract(1, clip), jnp.add(1, clip))
         gain = jnp.minimum(ratio * batch.advantage, clipped * batch.advantage)
@@ -126,7 +126,7 @@ def fisher_product(policy: Policy, params: Params, obs: Array, damping: ArrayLik
 
 OPTIMIZERS = {
     "adam": lambda rate: optax.adam(rate, eps=1e-5),  # ε as in the implementations of PPO (Andrychowicz et al. 2021)
-    "rmsprop": lambda rate: optax.rmsprop(rate, decay=0.99, eps=1e-5, eps_in_sqrt=False),  # as A3C (Mnih et al. 2016)
+    "rmsprop": lambda rate: optax.rmsprop(rate, decay=0.99, eps=1e-5, eps_in_sqrt=False),  # as stable-baselines3
 }
 
 

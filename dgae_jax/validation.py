@@ -10,11 +10,11 @@ from dgae_jax.algorithms import TABLE
 from dgae_jax.config import Config, ConfigError, PolicyConfig, flag, resolve
 from dgae_jax.critics import CRITICS, RESIDUALS, TARGETS
 from dgae_jax.distortion import weights_of
-from dgae_jax.envs.registry import BRAX, PHYSICS, TASKS, VERSIONS
+from dgae_jax.envs.registry import BRAX, PHYSICS, TASKS, VERSIONS, make_env
 from dgae_jax.networks import COVARIANCES
 from dgae_jax.updates import OPTIMIZERS, UPDATES
 
-LARGEST_BUDGET = 2**31 - 1
+LARGEST = 2**31 - 1
 
 _PARTS = (("policy", "update", UPDATES), ("critic", "kind", CRITICS), ("critic", "target", TARGETS))
 
@@ -30,7 +30,7 @@ def _choice(path: str, value: str, table: Any) -> None:
 
 
 def _positive(path: str, value: int) -> None:
-    _check(path, value, value >= 1, "a whole number of at least 1")
+    _check(path, value, 1 <= value <= LARGEST, f"a whole number of at least 1 and at most {LARGEST:,}")
 
 
 def _between(path: str, value: float, low: float, high: float) -> None:
@@ -38,7 +38,7 @@ def _between(path: str, value: float, low: float, high: float) -> None:
 
 
 def _above_zero(path: str, value: float) -> None:
-    _check(path, value, value > 0 and math.isfinite(value), "a finite number above 0")
+    _check(path, value, 1e-30 <= value <= 1e30, "a number above 0, from 1e-30 to 1e30")
 
 
 def validate(config: Config) -> None:
@@ -50,10 +50,11 @@ def validate(config: Config) -> None:
     _choice("physics", config.physics, PHYSICS)
     if config.env.startswith(BRAX):
         _validate_brax(config)
-    _between("seed", config.seed, 0, 2**32 - 1)
+    highest = 2**32 - config.num_seeds
+    _check("seed", config.seed, 0 <= config.seed <= highest, f"a whole number from 0 to {highest:,}")
     for name in ("num_seeds", "total_steps", "num_envs", "horizon", "episode_length"):
         _positive(name, getattr(config, name))
-    _check("total_steps", config.total_steps, config.total_steps <= LARGEST_BUDGET, f"at most {LARGEST_BUDGET:,}")
+    _check("num_envs", config.num_envs, config.samples <= LARGEST, f"such that num_envs * horizon is at most {LARGEST:,}")
     _between("gamma", config.gamma, 0, 1)
     _between("lam", config.lam, 0, 1)
     _choice("policy.covariance", config.policy.covariance, COVARIANCES)
@@ -74,10 +75,12 @@ def validate(config: Config) -> None:
 
 def _validate_brax(config: Config) -> None:
     name = config.env.removeprefix(BRAX)
+    known = name in brax.envs._envs and not name.startswith("dgae_")
+    _check("env", config.env, known, f"one of {', '.join(TASKS)}, or {BRAX}NAME with a name that brax.envs knows")
     try:
-        brax.envs.get_environment(name)
-    except KeyError:
-        _check("env", config.env, False, f"one of {', '.join(TASKS)}, or {BRAX}NAME with a name that brax.envs knows")
+        make_env(config.env)
+    except (ValueError, TypeError) as reason:
+        _check("env", config.env, False, f"an environment that Brax can build on mjx ({reason})")
     _check("physics", config.physics, config.physics == "mjx", f"mjx with an environment of Brax's own ({config.env})")
     _check("env_version", config.env_version, config.env_version == Config.env_version, "left out with an environment of Brax's own")
     _check("noise.initial", config.noise.initial, config.noise.initial == 0, "left out with an environment of Brax's own")
@@ -119,5 +122,7 @@ def _validate_use(config: Config) -> None:
         weights_of(config.metric, full.critic.quantiles)
     except ValueError as allowed:
         _check("metric", config.metric, False, str(allowed))
+    calibrated = not config.diagnostics or full.critic.kind == "quantile"
+    _check("diagnostics", config.diagnostics, calibrated, f"left out: the critic of {config.algo} is no distribution")
     used = config.metric == "mean" or (full.residual == "distributional" and full.critic.kind == "quantile")
     _check("metric", config.metric, used, "mean, or used with a distributional residual and a quantile critic")

@@ -35,6 +35,10 @@ def main() -> int:
     arguments = cli.parse(Arguments, "Evaluate the deterministic policy of a trained run.")
     if arguments.episodes < 1:
         cli.fail(f"--episodes {arguments.episodes}: must be a whole number of at least 1")
+    if not 0 <= arguments.seed < 2**31:
+        cli.fail(f"--seed {arguments.seed}: must be a whole number from 0 to {2**31 - 1:,}")
+    if arguments.out and (arguments.out.is_dir() or not arguments.out.absolute().parent.is_dir()):
+        cli.fail(f"--out {arguments.out}: must be a file in a directory that exists")
     out = arguments.out or arguments.run_dir / f"evaluation-{arguments.engine}.json"
     try:
         config = run_directory.read_config(arguments.run_dir)

@@ -164,6 +164,19 @@ _BODY = "<worldbody><geom type='plane' size='1 1 1'/><body pos='0 0 1'>{}<geom s
             "<option integrator='RK4'/>" + _BODY.format("<joint name='a'/>") + "<equality><joint joint1='a'/></equality>",
             "equality constraints",
         ),
+        (
+            "<option integrator='RK4'/>"
+            + _BODY.format("<freejoint name='a'/>")
+            + "<actuator><motor joint='a' gear='0 0 0 0 0 1'/></actuator>",
+            "actuators other than motors at hinges",
+        ),
+        ("<option integrator='RK4'/>" + _BODY.format("<joint/>").replace("size='.1'", "size='.1' solref='-9 -9'"), "contact softness"),
+        (
+            "<option integrator='RK4'/><worldbody><body pos='1 0 0'><geom type='plane' size='1 1 1'/></body><body><joint/>"
+            "<geom size='.1'/></body></worldbody>",
+            "more than one tree, colliding geoms other than",
+        ),
+        ("<option integrator='RK4'/>" + _BODY.format("<joint damping='1 2'/>"), "dof dampingpoly"),
     ],
 )
 def test_mjx_refuses_by_name_a_model_it_does_not_cover(xml, reason):

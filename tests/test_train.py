@@ -194,7 +194,7 @@ def test_observation_statistics_are_those_of_all_samples_seen(key):
     state = normalizers.observations(2)
     assert_array_equal(normalizers.normalize(state, obs[0]), jnp.clip(obs[0], -10, 10))
     for rollout in obs:
-        state = normalizers.observe(state, rollout)
+        state = normalizers.observe(state, rollout, jnp.ones((10, 5), bool))
     assert isinstance(state, running_statistics.RunningStatisticsState)
     flat = np.asarray(obs).reshape(-1, 2)
     assert_allclose(normalizers.normalize(state, obs[0]), (np.asarray(obs[0]) - flat.mean(0)) / flat.std(0), rtol=1e-3, atol=1e-4)

@@ -26,7 +26,9 @@ def example(seed=0, count=200):
     action = gaussian.sample(key, here)
     advantage = jnp.sin(action[:, 0] + obs[:, 1]) - 0.5 * action[:, 1] ** 2
     advantage = (advantage - advantage.mean()) / advantage.std()
-    return params, Batch(obs, action, gaussian.log_prob(here, action), advantage, advantage[:, None], advantage, advantage, obs)
+    return params, Batch(
+        obs, action, gaussian.log_prob(here, action), advantage, advantage[:, None], advantage, advantage, obs, jnp.ones(count, bool)
+    )
 
 
 def update(loss=None, **changes):

@@ -27,7 +27,7 @@ def batch(policy, params, key):
     action = gaussian.sample(key, distribution)
     advantage, reward = jax.random.normal(key, (2, 24))
     log_prob = gaussian.log_prob(distribution, action)
-    return Batch(obs, action, log_prob, advantage, advantage[:, None], reward, jnp.full(24, 0.9), next_obs)
+    return Batch(obs, action, log_prob, advantage, advantage[:, None], reward, jnp.full(24, 0.9), next_obs, jnp.ones(24, bool))
 
 
 def distance(a, b):
@@ -120,6 +120,23 @@ def critic_of(kind, target):
     return critics.scalar(3, **options) if kind == "scalar" else critics.quantile(3, **options, quantiles=4, kappa=1.0)
 
 
+def test_a_sample_that_is_not_sound_weighs_nothing_in_policy_and_critic(policy, params, batch, key):
+    critic = critics.quantile(3, hidden=(4,), target="sr-lambda", quantiles=1, kappa=1.0)
+    values = critic.init(key)
+    broken = batch._replace(
+        sound=batch.sound.at[5].set(False),
+        advantage=batch.advantage.at[5].set(0),
+        action=batch.action.at[5].set(0),
+        log_prob=batch.log_prob.at[5].set(-1e4),
+        target=batch.target.at[5].set(1e9),
+    )
+    without = jax.tree.map(lambda x: jnp.delete(x, 5, axis=0), batch)
+    for loss, at in ((surrogate(policy, 0.2), params), (surrogate(policy), params), (critic.loss, values)):
+        got, want = (jax.grad(loss, has_aux=True)(at, b)[0] for b in (broken, without))
+        assert distance(jax.tree.map(lambda g: g * 24 / 23, got), want) < 1e-5
+    assert surrogate(policy)(params, broken)[1]["kl"] == 0
+
+
 @pytest.mark.parametrize("kind", ["scalar", "quantile"])
 @pytest.mark.parametrize("target", critics.TARGETS)
 def test_every_critic_takes_every_target(kind, target, key):
@@ -130,9 +147,8 @@ def test_every_critic_takes_every_target(kind, target, key):
     got = critic.target(key, reward, factor, factor, z, z_next)
     assert got.shape == (6, 5, 1 if target == "lambda-return" else z.shape[-1])
     empty = jnp.zeros(30)
-    flat = Batch(
-        obs.reshape(30, 3), empty[:, None], empty, empty, got.reshape(30, -1), reward.ravel(), factor.ravel(), next_obs.reshape(30, 3)
-    )
+    columns = obs.reshape(30, 3), empty[:, None], empty, empty, got.reshape(30, -1), reward.ravel(), factor.ravel(), next_obs.reshape(30, 3)
+    flat = Batch(*columns, sound=jnp.ones(30, bool))
     gradient = jax.grad(critic.loss, has_aux=True)(params, flat)[0]
     assert 0 < float(optax.global_norm(gradient)) < 1e3
 

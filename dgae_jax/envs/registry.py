@@ -1,5 +1,6 @@
 """Tasks and physics by name."""
 
+import warnings
 from functools import partial
 
 import brax.envs
@@ -54,7 +55,9 @@ def _make_brax(name: str, physics: str, **parameters) -> Env:
     if physics != "mjx":
         raise ValueError(f"environments of Brax's own run on mjx, not on {physics}")
     try:
-        return BraxTask(brax.envs.get_environment(name, backend="mjx", **parameters))
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # Brax speaks of features of its model files that it leaves out
+            return BraxTask(brax.envs.get_environment(name, backend="mjx", **parameters))
     except KeyError:
         raise ValueError(f"unknown environment {BRAX}{name}; brax.envs knows no {name!r}") from None
 

@@ -12,7 +12,7 @@ import tyro
 
 T = TypeVar("T")
 
-_FRAME = re.compile(r"[╭╮╰╯│─|+]|-{3,}")
+_FRAME = re.compile(r"[╭╮╰╯├┤│─ ]*")
 
 
 def fail(message: str) -> NoReturn:
@@ -27,7 +27,7 @@ def peek(argv: Sequence[str] | None = None, **defaults: str) -> dict[str, str]:
     parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False, exit_on_error=False)
     for name, default in defaults.items():
         parser.add_argument("--" + name.replace("_", "."), dest=name, default=default, nargs="?")
-    return {name: value or defaults[name] for name, value in vars(parser.parse_known_args(argv)[0]).items()}
+    return {name: defaults[name] if value is None else value for name, value in vars(parser.parse_known_args(argv)[0]).items()}
 
 
 def parse(cls: type[T], description: str, argv: Sequence[str] | None = None, default: T | None = None) -> T:
@@ -45,6 +45,6 @@ def parse(cls: type[T], description: str, argv: Sequence[str] | None = None, def
 
 def _one_line(box: str) -> str:
     """The sentence inside tyro's framed message, without title, frame and pointer to the help text."""
-    lines = [_FRAME.sub(" ", line).strip() for line in box.splitlines()[1:]]
+    lines = [line.strip().strip("│").strip() for line in box.splitlines()[1:] if not _FRAME.fullmatch(line.strip())]
     body = " ".join(line for line in lines if line).partition("For full helptext")[0]
     return re.sub(r"\s+", " ", body).strip() + " (--help lists every flag)"

@@ -73,8 +73,11 @@ def read_config_file(path: Path) -> Config:
 def write_json(path: Path, data: Any) -> None:
     """Indented JSON, in place at once or not at all."""
     part = path.with_name(path.name + ".part")
-    part.write_text(json.dumps(data, indent=2) + "\n")
-    part.replace(path)
+    try:
+        part.write_text(json.dumps(data, indent=2) + "\n")
+        part.replace(path)
+    finally:
+        part.unlink(missing_ok=True)
 
 
 def _manifest() -> dict[str, Any]:

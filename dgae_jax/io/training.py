@@ -135,11 +135,11 @@ def use_cache(cache_dir: str) -> None:
     if cache_dir == "none":
         jax.config.update("jax_enable_compilation_cache", False)
         return
-    path = Path(cache_dir).expanduser()
     try:
+        path = Path(cache_dir).expanduser()
         path.mkdir(parents=True, exist_ok=True)
-    except OSError as reason:
-        raise ConfigError(f"--cache-dir {cache_dir}: must be a directory that can be written, or none ({reason.strerror})") from reason
+    except (OSError, RuntimeError) as reason:
+        raise ConfigError(f"--cache-dir {cache_dir}: must be a directory that can be written, or none ({reason})") from reason
     jax.config.update("jax_compilation_cache_dir", str(path))
 
 

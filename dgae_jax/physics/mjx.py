@@ -1,4 +1,4 @@
-"""MuJoCo in JAX, stepped so that it compiles fast, runs as fast as C on a core and agrees with it.
+"""MuJoCo in JAX, stepped so that it compiles fast, runs about as fast as C on a core and agrees with it.
 
 - The world is the last axis of every array, so that all arithmetic runs along it; the stages of MuJoCo's forward dynamics
   (`dynamics`, `contacts`, `newton`) are written for that, and each agrees with C's.

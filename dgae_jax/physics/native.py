@@ -1,6 +1,6 @@
 """C MuJoCo inside a jitted program: `mujoco.batch` behind a pure callback, bit for bit what `mj_step` computes.
 
-It compiles in a second, runs on CPU threads, and is the referee for the other engines.
+It compiles in seconds, runs on CPU threads, and is the referee for the other engines.
 """
 
 import os
