@@ -111,7 +111,7 @@ def test_a_directory_in_use_is_refused_and_left_alone(finished):
 
 
 def test_updates_that_are_not_finite_are_left_out_and_counted_and_end_the_run_when_there_is_no_other(tmp_path, capsys):
-    broken = dataclasses.replace(small("ppo"), policy=dataclasses.replace(SMALL.policy, learning_rate=1e38, max_grad_norm=1e38))
+    broken = dataclasses.replace(small("ppo"), policy=dataclasses.replace(SMALL.policy, learning_rate=1e30, max_grad_norm=1e30))
     options = dataclasses.replace(QUIET, run_dir=tmp_path / "run", max_nonfinite=3)
     assert train(broken, options) == 1
     assert "updates were not finite and were left out" in capsys.readouterr().err

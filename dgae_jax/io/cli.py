@@ -12,7 +12,7 @@ import tyro
 
 T = TypeVar("T")
 
-_FRAME = re.compile(r"[╭╮╰╯├┤│─ ]*")
+_FRAME = re.compile(r"[╭╮╰╯├┤│─+|\- ]*")  # tyro draws it in ASCII where the terminal has no more
 
 
 def fail(message: str) -> NoReturn:
@@ -45,6 +45,6 @@ def parse(cls: type[T], description: str, argv: Sequence[str] | None = None, def
 
 def _one_line(box: str) -> str:
     """The sentence inside tyro's framed message, without title, frame and pointer to the help text."""
-    lines = [line.strip().strip("│").strip() for line in box.splitlines()[1:] if not _FRAME.fullmatch(line.strip())]
+    lines = [line.strip().strip("│|").strip() for line in box.splitlines()[1:] if not _FRAME.fullmatch(line.strip())]
     body = " ".join(line for line in lines if line).partition("For full helptext")[0]
     return re.sub(r"\s+", " ", body).strip() + " (--help lists every flag)"
