@@ -176,17 +176,6 @@ def test_help_explains_every_flag(run):
         assert re.search(rf"{flag}\b", out)
 
 
-def test_mjx_without_an_accelerator_says_once_that_native_starts_faster(run, tmp_path, monkeypatch):
-    def stop(*_):
-        raise ConfigError("far enough")
-
-    monkeypatch.setattr("dgae_jax.io.training.make_trainer", stop)
-    for physics, times in (("mjx", 1), ("native", 0)):
-        _, out, err = run("train", "--physics", physics, "--run-dir", tmp_path / physics, "--cache-dir", "none")
-        assert err == "error: far enough\n"
-        assert out.count("--physics native starts and runs faster here") == times
-
-
 @pytest.mark.parametrize(("kind", "code"), [(signal.SIGTERM, 143), (signal.SIGINT, 130)])
 def test_a_signal_saves_a_checkpoint_and_ends_with_its_code(kind, code, tmp_path):
     argv = ["--total-steps", "100_000_000", "--run-dir", str(tmp_path / "run"), *TINY]

@@ -112,8 +112,6 @@ def _last_state(run_dir: Path, config: Config) -> TrainState | None:
 
 def _run(config: Config, options: RunOptions, run_dir: Path, state: TrainState | None) -> int:
     print(_budget(config))
-    if config.physics == "mjx" and jax.default_backend() == "cpu" and not config.env.startswith(BRAX):
-        print("no accelerator: --physics native starts and runs faster here")
     with Signals() as signals:
         state = _iterate(config, options, run_dir, signals, state)
     if _broken(state, options):
