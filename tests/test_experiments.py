@@ -12,7 +12,6 @@ from pathlib import Path
 
 import pytest
 
-from dgae_jax.config import ConfigError
 from dgae_jax.io import metrics
 
 ROOT = Path(__file__).parent.parent
