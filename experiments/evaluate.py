@@ -8,7 +8,7 @@ from typing import Literal
 import tyro
 
 from dgae_jax import ConfigError
-from dgae_jax.io import cli, run_directory
+from dgae_jax.io import cli, files, run_directory
 from dgae_jax.io.checkpoint import CheckpointError
 from dgae_jax.io.evaluation import evaluate_run
 from dgae_jax.io.training import describe
@@ -22,6 +22,8 @@ class Arguments:
     """Directory of the run [path]."""
     engine: Literal["gymnasium", "native", "mjx"] = "gymnasium"
     """gymnasium (the task of the gymnasium package), native (ours in C MuJoCo) or mjx (ours in JAX)."""
+    checkpoint: Literal["newest", "best"] = "newest"
+    """newest, or best: of the evaluations while it trained, whose episodes chose it; take another --seed to judge it."""
     episodes: int = 20
     """Episodes per trained run [episodes]."""
     seed: int = 0
@@ -31,7 +33,7 @@ class Arguments:
 
 
 def main() -> int:
-    """Evaluate one run directory; 0 done, 2 bad input."""
+    """Evaluate one run directory; 0 done, 2 bad input, 130 stopped by SIGINT."""
     arguments = cli.parse(Arguments, "Evaluate the deterministic policy of a trained run.")
     if arguments.episodes < 1:
         cli.fail(f"--episodes {arguments.episodes}: must be a whole number of at least 1")
@@ -42,12 +44,16 @@ def main() -> int:
     out = arguments.out or arguments.run_dir / f"evaluation-{arguments.engine}.json"
     try:
         config = run_directory.read_config(arguments.run_dir)
-        result = evaluate_run(arguments.run_dir, config, engine=arguments.engine, episodes=arguments.episodes, seed=arguments.seed)
-        run_directory.write_json(out, result)
+        how = {"which": arguments.checkpoint, "engine": arguments.engine, "episodes": arguments.episodes, "seed": arguments.seed}
+        result = evaluate_run(arguments.run_dir, config, **how)
+        files.write_json(out, result)
     except (ConfigError, CheckpointError) as mistake:
         cli.fail(str(mistake))
     except OSError as reason:
         cli.fail(f"--out {out}: must be a file that can be written ({reason.strerror})")
+    except KeyboardInterrupt:
+        print("stopped by SIGINT, nothing written", file=sys.stderr)
+        return 130
     print(f"{describe(result)}; written to {out}")
     return 0
 

@@ -10,7 +10,8 @@ import tyro
 from dgae_jax import Config, ConfigError, presets
 from dgae_jax.io import cli, run_directory
 from dgae_jax.io.checkpoint import CheckpointError
-from dgae_jax.io.training import RunOptions, resume, train
+from dgae_jax.io.options import RunOptions
+from dgae_jax.io.training import resume, train
 
 
 @dataclass(frozen=True)
@@ -26,23 +27,32 @@ class Arguments:
 
 
 def main() -> int:
-    """Train one run directory; 0 done, 2 bad input, 130 / 143 stopped by a signal with a checkpoint saved."""
+    """Train one run directory.
+
+    0 done; 1 broke down or could write no more; 2 bad input; 130 / 143 stopped by SIGINT / SIGTERM with a checkpoint saved.
+    """
     try:
-        config = _start(**cli.peek(preset="tuned", algo=Config.algo, env=Config.env, policy_update="default", config="", resume=""))
+        config = _start(**cli.peek(preset="", algo=Config.algo, env=Config.env, policy_update="default", config="", resume=""))
         description = "Train a policy on a MuJoCo task with PPO, TRPO, A2C or their distributional variants."
         arguments = cli.parse(Arguments, description, default=Arguments(settings=config))
         return (resume if arguments.run.resume else train)(arguments.settings, arguments.run)
     except (ConfigError, CheckpointError) as mistake:
         cli.fail(str(mistake))
+    except KeyboardInterrupt:
+        print("stopped by SIGINT before training began", file=sys.stderr)
+        return 130
 
 
 def _start(preset: str, algo: str, env: str, policy_update: str, config: str, resume: str) -> Config:
     """Where all settings start that no flag names: a run's own, a file's, or a preset's."""
+    for name, value, other in (("preset", preset, resume or config), ("config", config, resume)):
+        if value and other:
+            raise ConfigError(f"--{name} {value}: must be left out: all settings start from {other}")
     if resume:
         return run_directory.read_config(Path(resume))
     if config:
         return run_directory.read_config_file(Path(config))
-    return presets.preset(preset, algo, env, policy_update)
+    return presets.preset(preset or "tuned", algo, env, policy_update)
 
 
 if __name__ == "__main__":

@@ -2,7 +2,7 @@
 
 import hashlib
 import json
-import os
+import re
 from pathlib import Path
 
 import jax
@@ -12,6 +12,7 @@ from flax import serialization
 
 from dgae_jax.build import make_task, make_trainer, seed_keys
 from dgae_jax.config import Config
+from dgae_jax.io import files
 from dgae_jax.types import TrainState
 
 SCHEMA = 1
@@ -26,27 +27,34 @@ class DamagedError(CheckpointError):
     """A checkpoint whose bytes are not what was written; an older one may be whole."""
 
 
-def save(directory: Path, state: TrainState, steps: int, keep: int = 3) -> Path:
-    """Write `steps_….msgpack`, complete or not at all, and delete all but the newest `keep`.
+def arrays_of(state: TrainState) -> dict[str, np.ndarray]:
+    """A copy of the state's arrays by name."""
+    return {name: np.array(x) for name, x in _plain(state).items()}
+
+
+def save(directory: Path, arrays: dict[str, np.ndarray], steps: int, keep: int = 3, best: int | None = None) -> Path:
+    """Write `steps_….msgpack`, complete or not at all, and delete all but the newest `keep` and that of `best` steps.
 
     The file is one line of JSON, with schema and checksum, and the arrays in msgpack.
     """
-    path = directory / f"steps_{steps:012d}.msgpack"
-    part = path.with_suffix(".part")
-    arrays = serialization.msgpack_serialize(jax.tree.map(np.asarray, _plain(state)))
-    header = {"schema": SCHEMA, "sha256": hashlib.sha256(arrays).hexdigest()}
-    with part.open("wb") as file:
-        file.write(json.dumps(header).encode() + b"\n" + arrays)
-        file.flush()
-        os.fsync(file.fileno())
-    part.replace(path)
-    for old in _found(directory)[:-keep]:
-        old.unlink()
+    path = directory / _name_of(steps)
+    body = serialization.msgpack_serialize(arrays)
+    header = {"schema": SCHEMA, "sha256": hashlib.sha256(body).hexdigest()}
+    files.replace(path, json.dumps(header).encode() + b"\n" + body)
+    for old in found(directory)[:-keep]:
+        if best is None or old.name != _name_of(best):
+            old.unlink(missing_ok=True)
     return path
 
 
-def _found(directory: Path) -> list[Path]:
-    return sorted(p for p in directory.glob("steps_*.msgpack") if p.is_file() and not p.is_symlink())
+def _name_of(steps: int) -> str:
+    return f"steps_{steps:012d}.msgpack"
+
+
+def found(directory: Path) -> list[Path]:
+    """The checkpoints in a directory, oldest first; no link is followed."""
+    named = (p for p in directory.glob("steps_*.msgpack") if re.fullmatch(r"steps_\d{12,18}\.msgpack", p.name))
+    return sorted(p for p in named if p.is_file() and not p.is_symlink())
 
 
 def newest(run_dir: Path, config: Config) -> tuple[TrainState, Path, list[str]]:
@@ -55,12 +63,18 @@ def newest(run_dir: Path, config: Config) -> tuple[TrainState, Path, list[str]]:
     Raises CheckpointError if there is none.
     """
     wrong = []
-    for path in reversed(_found(run_dir / "checkpoints")):
+    for path in reversed(found(run_dir / "checkpoints")):
         try:
             return load(path, config), path, wrong
         except DamagedError as reason:
             wrong.append(str(reason))
     raise CheckpointError("; ".join(wrong) or f"{run_dir}: must hold a checkpoint; checkpoints/ has none")
+
+
+def at(run_dir: Path, steps: int, config: Config) -> tuple[TrainState, Path]:
+    """The state after `steps` samples and its file; raises as `load`."""
+    path = run_dir / "checkpoints" / _name_of(steps)
+    return load(path, config), path
 
 
 def load(path: Path, config: Config) -> TrainState:
@@ -74,9 +88,12 @@ def load(path: Path, config: Config) -> TrainState:
     for name in sorted(set(got) ^ set(want)):
         raise CheckpointError(f"{path}: is of another run, {name} is {'unknown here' if name in got else 'missing'}")
     for name, like in want.items():
-        found = f"{got[name].dtype}{got[name].shape}"
-        if found != f"{like.dtype}{like.shape}":
-            raise CheckpointError(f"{path}: is of another run, {name} is {found}, here {like.dtype}{like.shape}")
+        kind = f"{got[name].dtype}{got[name].shape}"
+        if kind != f"{like.dtype}{like.shape}":
+            raise CheckpointError(f"{path}: is of another run, {name} is {kind}, here {like.dtype}{like.shape}")
+    for iteration in got["iteration"]:
+        if path.name != _name_of(int(iteration) * config.samples):
+            raise CheckpointError(f"{path}: is of another run, or renamed: it was saved after {iteration} iterations")
 
     def restored(path, like):
         leaf = jnp.asarray(got[_name(path)])

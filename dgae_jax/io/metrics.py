@@ -2,8 +2,9 @@
 
 import contextlib
 import itertools
-import json
 import math
+import os
+from array import array
 from pathlib import Path
 from typing import Any
 
@@ -11,48 +12,57 @@ import jax
 import numpy as np
 
 from dgae_jax.config import Config, ConfigError
+from dgae_jax.io import files
 
 
 class MetricsFile:
-    """Appends to `metrics.jsonl`; `steps` counts the samples of one run, numbers that do not exist are null."""
+    """Appends to `metrics.jsonl`; `steps` counts the samples of one run, numbers that do not exist are null.
+
+    Of the rows it keeps only the episode returns, so that a long run does not fill the memory.
+    """
 
     def __init__(self, path: Path, config: Config, done: int):
         """Keep the rows of the first `done` iterations; raises ConfigError if the file lacks any of them."""
-        self.path, self.first_seed, self.samples, self.iteration = path, config.seed, config.samples, done
-        self.rows = _first(path, done, config.num_seeds) if done else []
-        part = path.with_suffix(".part")
-        part.write_text("".join(json.dumps(row) + "\n" for row in self.rows))
-        part.replace(path)
+        self.path, self.first_seed, self.seeds, self.samples = path, config.seed, config.num_seeds, config.samples
+        self.iteration, self.seconds = 0, 0.0
+        self.returns = array("d")
+        """Episode returns of the rows so far, NaN where there was none."""
+        end = 0
+        with contextlib.suppress(FileNotFoundError, LookupError, TypeError, ValueError, OverflowError):
+            for row, behind in itertools.islice(files.whole_rows(path), done * self.seeds):
+                iteration, seed = divmod(len(self.returns), self.seeds)
+                if (row["iteration"], row["seed"]) != (iteration + 1, config.seed + seed):
+                    break
+                self._take(row)
+                end = behind
+        if len(self.returns) != done * self.seeds:
+            raise ConfigError(f"{path}: must hold the {done:,} iterations of the checkpoint, one line per iteration and seed")
+        path.touch()
+        os.truncate(path, end)
 
-    @property
-    def seconds(self) -> float:
-        """Time of training in the rows so far."""
-        return self.rows[-1]["seconds"] if self.rows else 0.0
+    def _take(self, row: dict[str, Any]) -> None:
+        value = row["episode_return"]
+        self.iteration, self.seconds = row["iteration"], float(row["seconds"])
+        self.returns.append(math.nan if value is None else value)
 
     def append(self, metrics: dict[str, Any], count: int, seconds: float) -> list[dict[str, Any]]:
         """Write `count` iterations of metrics [capacity, S]; `seconds` is the time since training began."""
         columns = {name: np.asarray(value, np.float64)[:count] for name, value in jax.device_get(metrics).items()}
         rows = []
         for i in range(count):
-            self.iteration += 1
-            head = {"iteration": self.iteration, "steps": self.iteration * self.samples}
-            for s in range(next(iter(columns.values())).shape[1]):
+            head = {"iteration": self.iteration + i + 1, "steps": (self.iteration + i + 1) * self.samples}
+            for s in range(self.seeds):
                 numbers = {name: _number(column[i, s]) for name, column in columns.items()}
                 rows.append({**head, "seed": self.first_seed + s, "seconds": round(seconds, 3), **numbers})
-        with self.path.open("a") as file:
-            file.writelines(json.dumps(row) + "\n" for row in rows)
-        self.rows += rows
+        files.append_rows(self.path, rows)
+        for row in rows:
+            self._take(row)
         return rows
 
-
-def _first(path: Path, done: int, seeds: int) -> list[dict[str, Any]]:
-    rows = []
-    with contextlib.suppress(OSError, ValueError), path.open() as file:
-        for line in itertools.islice(file, done * seeds):
-            rows.append(json.loads(line))
-    if [row.get("iteration") for row in rows if isinstance(row, dict)] != [i + 1 for i in range(done) for _ in range(seeds)]:
-        raise ConfigError(f"{path}: must hold the {done:,} iterations of the checkpoint, one line per iteration and seed")
-    return rows
+    def curve(self) -> tuple[np.ndarray, np.ndarray]:
+        """Samples [I] and episode returns [I, S] of every iteration so far."""
+        returns = np.array(self.returns).reshape(-1, self.seeds)
+        return self.samples * np.arange(1, len(returns) + 1), returns
 
 
 def _number(x: float) -> float | int | None:
@@ -62,6 +72,5 @@ def _number(x: float) -> float | int | None:
 
 
 def read(path: Path) -> list[dict[str, Any]]:
-    """The rows of a `metrics.jsonl`."""
-    with path.open() as file:
-        return [json.loads(line) for line in file]
+    """The rows of a `metrics.jsonl`, or any other file of JSON lines, up to a line that is torn."""
+    return [row for row, _ in files.whole_rows(path)]

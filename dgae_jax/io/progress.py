@@ -22,6 +22,9 @@ class Reporter:
         else:
             print("compiling", flush=True)
 
+    def __enter__(self) -> "Reporter":
+        return self
+
     def update(self, steps: int, speed: float, mean_return: float | None) -> None:
         """`speed` in samples of one run per second; returns may not exist yet."""
         left = (self.total - steps) / speed
@@ -33,8 +36,7 @@ class Reporter:
             self.printed = time.monotonic()
             print(text, flush=True)
 
-    def close(self) -> None:
-        """Leave the terminal as it was."""
+    def __exit__(self, *_) -> None:
         if self.bar:
             self.bar.stop()
 

@@ -72,16 +72,21 @@ def mjx(spec: mujoco.MjSpec, frame_skip: int, *, contact_forces: bool = False, m
 
 
 def _in_blocks(advance):
-    """On a CPU, worlds in blocks, one after the other."""
+    """On a CPU, worlds in blocks of about the same size, one after the other."""
 
     def blocks(state: PhysicsState, ctrl: Array) -> PhysicsState:
         worlds = ctrl.shape[-1]
-        size = max(d for d in range(1, min(worlds, _BLOCK) + 1) if worlds % d == 0)
-        if jax.default_backend() != "cpu" or size in (worlds, 1):
+        count = -(-worlds // _BLOCK)
+        if jax.default_backend() != "cpu" or count == 1:
             return advance(state, ctrl)
-        split = jax.tree.map(lambda x: jnp.moveaxis(x.reshape(*x.shape[:-1], worlds // size, size), -2, 0), (state, ctrl))
-        out = jax.lax.map(lambda block: advance(*block), split)
-        return jax.tree.map(lambda x: jnp.moveaxis(x, 0, -2).reshape(*x.shape[1:-1], worlds), out)
+        size = -(-worlds // count)
+
+        def split(x):
+            full = jnp.pad(x, [(0, 0)] * (x.ndim - 1) + [(0, count * size - worlds)], mode="edge")
+            return jnp.moveaxis(full.reshape(*x.shape[:-1], count, size), -2, 0)
+
+        out = jax.lax.map(lambda block: advance(*block), jax.tree.map(split, (state, ctrl)))
+        return jax.tree.map(lambda x: jnp.moveaxis(x, 0, -2).reshape(*x.shape[1:-1], count * size)[..., :worlds], out)
 
     return blocks
 

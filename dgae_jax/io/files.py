@@ -1,0 +1,64 @@
+"""Files that are whole or not there, and files that grow line by line."""
+
+import contextlib
+import json
+import os
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+from typing import Any
+
+
+def replace(path: Path, data: bytes) -> None:
+    """`data` as the file `path`, complete or not at all: a crash at any byte leaves what was there. No link is followed."""
+    part = path.with_name(path.name + ".part")
+    with _named(path):
+        part.unlink(missing_ok=True)  # of a crash, or a link that was laid there
+        try:
+            with part.open("xb") as file:
+                file.write(data)
+                file.flush()
+                os.fsync(file.fileno())
+            part.replace(path)
+        finally:
+            part.unlink(missing_ok=True)
+
+
+def write_json(path: Path, data: Any) -> None:
+    """Indented JSON, complete or not at all."""
+    replace(path, (json.dumps(data, indent=2) + "\n").encode())
+
+
+def json_lines(rows: Iterable[dict[str, Any]]) -> bytes:
+    """One line of JSON per row."""
+    return "".join(json.dumps(row) + "\n" for row in rows).encode()
+
+
+def append_rows(path: Path, rows: Iterable[dict[str, Any]]) -> None:
+    """Add rows to a file of JSON lines."""
+    with _named(path), path.open("ab") as file:
+        file.write(json_lines(rows))
+
+
+def whole_rows(path: Path) -> Iterator[tuple[dict[str, Any], int]]:
+    """Each row of a file of JSON lines and the offset behind it, up to the first line that is torn or not a row."""
+    end = 0
+    with path.open("rb") as file:
+        for line in file:
+            end += len(line)
+            try:
+                row = json.loads(line)
+            except (ValueError, RecursionError):
+                return
+            if not (isinstance(row, dict) and line.endswith(b"\n")):
+                return
+            yield row, end
+
+
+@contextlib.contextmanager
+def _named(path: Path) -> Iterator[None]:
+    """Errors of the operating system say which file they are about, also when a write or a close fails."""
+    try:
+        yield
+    except OSError as reason:
+        reason.filename = str(path)
+        raise

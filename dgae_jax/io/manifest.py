@@ -1,0 +1,96 @@
+"""`manifest.json`: by what a run was computed, and what of that is different now."""
+
+import importlib.metadata
+import json
+import os
+import platform
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import jax
+
+from dgae_jax.io import files
+
+_VERSIONS_OF = ("dgae_jax", "jax", "jaxlib", "flax", "optax", "brax", "mujoco", "mujoco-mjx", "gymnasium", "numpy")
+
+
+def write(run_dir: Path) -> None:
+    """The first part of a run."""
+    files.write_json(run_dir / "manifest.json", {**_now(), "resumed": []})
+
+
+def add(run_dir: Path) -> None:
+    """A part that continues it."""
+    before = _read(run_dir)
+    files.write_json(run_dir / "manifest.json", {**before, "resumed": [*_resumed(before), _now()]})
+
+
+def changes(run_dir: Path) -> list[str]:
+    """What decides the bits of a result and is not what it was in the last part of the run."""
+    before = _read(run_dir)
+    was, now = _deciding((_resumed(before) or [before])[-1]), _deciding(_now())
+    return [f"{name} {value} (was {was.get(name)})" for name, value in now.items() if was.get(name) != value]
+
+
+def _deciding(part: Any) -> dict[str, Any]:
+    part = part if isinstance(part, dict) else {}
+    versions = part.get("versions")
+    return {name: part.get(name) for name in ("device", "devices", "cores")} | (versions if isinstance(versions, dict) else {})
+
+
+def _read(run_dir: Path) -> dict[str, Any]:
+    """The manifest; empty if there is none that can be understood."""
+    try:
+        found = json.loads((run_dir / "manifest.json").read_text())
+    except (OSError, ValueError, RecursionError):
+        return {}
+    return found if isinstance(found, dict) else {}
+
+
+def _resumed(manifest: dict[str, Any]) -> list[Any]:
+    found = manifest.get("resumed")
+    return found if isinstance(found, list) else []
+
+
+def _now() -> dict[str, Any]:
+    return {
+        "started": time.strftime("%Y-%m-%dT%H:%M:%S%z"),
+        "command": sys.argv,
+        "git_revision": _git_revision(),
+        "python": platform.python_version(),
+        "platform": platform.platform(),
+        "device": f"{jax.default_backend()}: {jax.devices()[0].device_kind}",
+        "devices": jax.device_count(),
+        "cores": _cores(),
+        "versions": {name: _version(name) for name in _VERSIONS_OF},
+    }
+
+
+def _cores() -> int | None:
+    """Cores this process may use: on a CPU their number decides how sums are split, and so their rounding."""
+    if jax.default_backend() != "cpu":
+        return None
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+
+
+def _version(name: str) -> str | None:
+    try:
+        return importlib.metadata.version(name)
+    except importlib.metadata.PackageNotFoundError:
+        return None
+
+
+def _git_revision() -> str | None:
+    """The commit of the source tree, `+` appended where files differ from it; None outside a checkout."""
+
+    def git(*words: str) -> str:
+        done = subprocess.run(["git", *words], cwd=Path(__file__).parent, capture_output=True, text=True, check=True, timeout=5)
+        return done.stdout.strip()
+
+    try:
+        return git("rev-parse", "HEAD") + ("+" if git("status", "--porcelain", "--untracked-files=no") else "")
+    except (OSError, subprocess.SubprocessError):
+        return None
