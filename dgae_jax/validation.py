@@ -50,10 +50,10 @@ def validate(config: Config) -> None:
     _choice("physics", config.physics, PHYSICS)
     if config.env.startswith(BRAX):
         _validate_brax(config)
-    highest = 2**32 - config.num_seeds
-    _check("seed", config.seed, 0 <= config.seed <= highest, f"a whole number from 0 to {highest:,}")
     for name in ("num_seeds", "total_steps", "num_envs", "horizon", "episode_length"):
         _positive(name, getattr(config, name))
+    highest = 2**32 - config.num_seeds
+    _check("seed", config.seed, 0 <= config.seed <= highest, f"a whole number from 0 to {highest:,}")
     _check("num_envs", config.num_envs, config.samples <= LARGEST, f"such that num_envs * horizon is at most {LARGEST:,}")
     _between("gamma", config.gamma, 0, 1)
     _between("lam", config.lam, 0, 1)

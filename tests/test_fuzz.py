@@ -10,8 +10,10 @@ from hypothesis import strategies as st
 
 import dgae_jax as dg
 from dgae_jax.config import ConfigError, from_dict, to_dict
-from dgae_jax.io import checkpoint, cli, metrics
+from dgae_jax.io import checkpoint, cli, files, manifest, metrics
 from dgae_jax.io.checkpoint import CheckpointError
+from dgae_jax.io.evaluation import EvaluationsFile
+from dgae_jax.io.options import validate_options
 from dgae_jax.validation import validate
 from tests.test_experiments import command
 from tests.test_io import signed
@@ -24,7 +26,8 @@ PLAIN = st.recursive(
 )
 NAMES = sorted(to_dict(dg.Config())) + sorted(to_dict(dg.Config())["policy"]) + sorted(to_dict(dg.Config())["critic"])
 FLAGS = ["--" + part + name.replace("_", "-") for name in NAMES for part in ("", "policy.", "critic.", "noise.")] + [
-    "--preset", "--config", "--run-dir", "--resume", "--episodes", "--checkpoint-every", "--max-nonfinite", "--", "-h2", "--no-diagnostics",
+    "--preset", "--config", "--run-dir", "--resume", "--episodes", "--checkpoint-every", "--keep-checkpoints",
+    "--inexact", "--max-nonfinite", "--", "-h2", "--no-diagnostics",
 ]  # fmt: skip
 WORDS = st.sampled_from([*FLAGS, "ppo", "dtrpo", "hopper", "brax:ant", "brax:", "cvar:0.1", "nan", "inf", "-1", "1e400", "True"])
 
@@ -37,7 +40,7 @@ def test_any_command_line_is_understood_or_refused_in_one_line(words):
     with pytest.MonkeyPatch.context() as patch, contextlib.redirect_stderr(err), contextlib.redirect_stdout(out):
         patch.setattr("sys.argv", ["train.py", *words])
         for name in ("train", "resume"):  # all but the training itself
-            patch.setitem(module, name, lambda config, options: validate(config) or 0)
+            patch.setitem(module, name, lambda config, options: validate(config) or validate_options(options) or 0)
         try:
             code = main()
         except SystemExit as stop:
@@ -68,7 +71,10 @@ def test_any_json_is_a_configuration_or_refused(data):
         validate(from_dict(data))
 
 
-ROWS = "".join(json.dumps({"iteration": i, "steps": 10 * i, "seed": 0, "seconds": 1.0}) + "\n" for i in range(1, 6)).encode()
+ROWS = files.json_lines(
+    {"iteration": i, "steps": 10 * i, "seed": 0, "seconds": 1.0, "episode_return": 1.5, "return_mean": 1, "return_std": 0}
+    for i in range(1, 6)
+)
 
 
 @many
@@ -82,6 +88,33 @@ def test_any_tail_of_the_metrics_is_cut_or_refused(tmp_path_factory, cut, tail):
         return
     assert [row["iteration"] for row in metrics.read(path)] == [1, 2, 3]
     assert file.seconds == 1.0
+
+
+@many
+@given(st.integers(0, len(ROWS)), st.binary(max_size=30), st.integers(0, 99))
+def test_any_bytes_are_evaluations_as_far_as_they_are_rows(tmp_path_factory, cut, tail, steps):
+    path = tmp_path_factory.mktemp("evaluations") / "evaluations.jsonl"
+    path.write_bytes(ROWS[:cut] + tail)
+    file = EvaluationsFile(path)
+    file.cut(steps)
+    assert EvaluationsFile(path).rows == file.rows
+    assert file.best is None or file.best <= steps
+    assert file.points().shape == (len(file.rows), 3)
+
+
+MANIFEST = st.fixed_dictionaries(
+    {}, optional={"resumed": PLAIN | st.lists(PLAIN, max_size=2), "versions": PLAIN, "device": PLAIN, "cores": PLAIN}
+)
+
+
+@many
+@given(PLAIN | MANIFEST, st.binary(max_size=20))
+def test_any_manifest_is_another_machine_and_can_be_added_to(tmp_path_factory, data, noise):
+    run_dir = tmp_path_factory.mktemp("manifest")
+    (run_dir / "manifest.json").write_bytes(json.dumps(data).encode() + noise)
+    assert manifest.changes(run_dir)
+    manifest.add(run_dir)
+    assert manifest.changes(run_dir) == []
 
 
 ARRAYS = b"\x82\xa1a\xc7\x0e\x01\x93\x91\x02\xa7float32\xc4\x08" + bytes(8) + b"\xa1b\xc3"

@@ -1,10 +1,10 @@
 import dataclasses
 import hashlib
 import json
-import math
 
 import chex
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from matplotlib.image import imread
@@ -12,16 +12,23 @@ from matplotlib.image import imread
 import dgae_jax as dg
 from dgae_jax.build import make_task, make_trainer, seed_keys
 from dgae_jax.config import ConfigError, to_dict
-from dgae_jax.io import checkpoint, metrics, plots, run_directory
+from dgae_jax.io import checkpoint, files, metrics, plots, run_directory
 from dgae_jax.io.checkpoint import CheckpointError
-from dgae_jax.io.evaluation import evaluate_state
-from dgae_jax.io.training import _save_incidents
+from dgae_jax.io.evaluation import EvaluationsFile, evaluate_state
+from dgae_jax.io.options import RunOptions
+from dgae_jax.io.record import Record
 from tests.test_train import SMALL
 
 
 @pytest.fixture(scope="module")
 def state():
     return make_trainer(make_task(SMALL), 1).init(SMALL, seed_keys(SMALL))
+
+
+def saved(state, directory, steps, **keep):
+    """A checkpoint of `state` after so many samples."""
+    then = state._replace(iteration=jnp.full_like(state.iteration, steps // SMALL.samples))
+    return checkpoint.save(directory, checkpoint.arrays_of(then), steps, **keep)
 
 
 def plain(state):
@@ -34,17 +41,21 @@ def signed(arrays):
 
 
 def test_a_checkpoint_gives_the_state_back_bit_for_bit(state, tmp_path):
-    loaded = checkpoint.load(checkpoint.save(tmp_path, state, 64), SMALL)
+    loaded = checkpoint.load(saved(state, tmp_path, 0), SMALL)
     chex.assert_trees_all_equal(plain(loaded), plain(state))
     chex.assert_trees_all_equal_shapes_and_dtypes(loaded, state)
 
 
-def test_only_the_newest_checkpoints_are_kept(state, tmp_path):
-    (tmp_path / "checkpoints").mkdir()
-    for steps in (64, 9_000, 128, 10_000):
-        checkpoint.save(tmp_path / "checkpoints", state, steps, keep=2)
-    assert sorted(p.name for p in (tmp_path / "checkpoints").iterdir()) == ["steps_000000009000.msgpack", "steps_000000010000.msgpack"]
-    assert checkpoint.newest(tmp_path, SMALL)[1].name == "steps_000000010000.msgpack"
+def test_the_newest_checkpoints_are_kept_and_the_best(state, tmp_path):
+    directory = tmp_path / "checkpoints"
+    directory.mkdir()
+    for steps in (64, 128, 6400, 9600):
+        saved(state, directory, steps, keep=2, best=64)
+    assert [p.name for p in checkpoint.found(directory)] == [f"steps_{steps:012d}.msgpack" for steps in (64, 6400, 9600)]
+    assert checkpoint.newest(tmp_path, SMALL)[1].name == "steps_000000009600.msgpack"
+    assert checkpoint.at(tmp_path, 64, SMALL)[1].name == "steps_000000000064.msgpack"
+    saved(state, directory, 12800, keep=2, best=9600)
+    assert [p.name for p in checkpoint.found(directory)] == [f"steps_{steps:012d}.msgpack" for steps in (9600, 12800)]
 
 
 @pytest.mark.parametrize(
@@ -63,17 +74,23 @@ def test_only_the_newest_checkpoints_are_kept(state, tmp_path):
     ],
 )
 def test_a_damaged_checkpoint_is_refused_by_name(damage, reason, state, tmp_path):
-    path = checkpoint.save(tmp_path, state, 64)
+    path = saved(state, tmp_path, 64)
     path.write_bytes(damage(path.read_bytes()))
     with pytest.raises(CheckpointError, match=f"{path.name}: {reason}"):
         checkpoint.load(path, SMALL)
 
 
 def test_a_checkpoint_of_another_network_size_is_refused_by_leaf_and_shapes(state, tmp_path):
-    path = checkpoint.save(tmp_path, state, 64)
+    path = saved(state, tmp_path, 64)
     wider = dataclasses.replace(SMALL, policy=dataclasses.replace(SMALL.policy, hidden=(9,)))
     with pytest.raises(CheckpointError, match=r"is of another run, policy\..* is float32\(1, 8, 3\), here float32\(1, 9, 3\)"):
         checkpoint.load(path, wider)
+
+
+def test_a_renamed_checkpoint_is_refused(state, tmp_path):
+    path = saved(state, tmp_path, 64).rename(tmp_path / "steps_000000000128.msgpack")
+    with pytest.raises(CheckpointError, match="is of another run, or renamed: it was saved after 1 iterations"):
+        checkpoint.load(path, SMALL)
 
 
 def test_a_directory_without_checkpoints_is_refused(tmp_path):
@@ -84,7 +101,7 @@ def test_a_directory_without_checkpoints_is_refused(tmp_path):
 def test_a_damaged_checkpoint_gives_way_to_an_older_one_and_links_are_not_followed(state, tmp_path):
     directory = tmp_path / "checkpoints"
     directory.mkdir()
-    whole, broken = (checkpoint.save(directory, state, steps) for steps in (64, 128))
+    whole, broken = (saved(state, directory, steps) for steps in (64, 128))
     broken.write_bytes(broken.read_bytes()[:-1])
     (directory / "steps_000000000192.msgpack").symlink_to(whole)
     _, path, wrong = checkpoint.newest(tmp_path, SMALL)
@@ -111,26 +128,67 @@ def test_metrics_are_one_json_object_per_run_and_iteration(tmp_path):
 
 def test_metrics_continue_behind_the_checkpoint_whatever_followed_it(tmp_path):
     config, path = dg.Config(num_envs=10, horizon=10), tmp_path / "metrics.jsonl"
-    columns = {"reward": np.arange(8.0)[:, None]}
+    columns = {"episode_return": np.arange(8.0)[:, None]}
     metrics.MetricsFile(path, config, 0).append(columns, 8, 1.5)
     path.write_text(path.read_text() + '{"iteration": 9, "st')  # torn
     file = metrics.MetricsFile(path, config, 5)
-    assert file.seconds == 1.5
+    assert (file.iteration, file.seconds) == (5, 1.5)
     file.append(columns, 2, 2.0)
     assert [row["iteration"] for row in metrics.read(path)] == [1, 2, 3, 4, 5, 6, 7]
+    steps, returns = file.curve()
+    np.testing.assert_array_equal(steps, 100 * np.arange(1, 8))
+    np.testing.assert_array_equal(returns[:, 0], [0, 1, 2, 3, 4, 0, 1])
     with pytest.raises(ConfigError, match="must hold the 9 iterations"):
         metrics.MetricsFile(path, config, 9)
 
 
+EVALUATIONS = [
+    {"steps": steps, "seed": seed, "return_mean": mean, "return_std": 1.0}
+    for steps, means in ((100, (1.0, 9.0)), (200, (6.0, 6.0)), (300, (2.0, 10.0)), (400, (5.0, 5.0)))
+    for seed, mean in enumerate(means)
+]
+
+
+def test_the_best_evaluation_is_the_one_with_the_highest_mean_over_seeds_and_of_equals_the_later(tmp_path):
+    path = tmp_path / "evaluations.jsonl"
+    assert EvaluationsFile(path).best is None
+    files.append_rows(path, EVALUATIONS)
+    assert EvaluationsFile(path).best == 300
+    assert not EvaluationsFile(path).has(500)
+    cut = EvaluationsFile(path)
+    cut.cut(250)
+    assert EvaluationsFile(path).best == 200
+    np.testing.assert_array_equal(EvaluationsFile(path).points(), [[100, 1, 1], [100, 9, 1], [200, 6, 1], [200, 6, 1]])
+
+
+@pytest.mark.parametrize("row", [{}, {"steps": -1}, {"steps": 2.5}, {"steps": True}, {"return_mean": "9"}, {"return_mean": 1e400}])
+def test_an_evaluation_that_is_none_is_passed_over(row, tmp_path):
+    path = tmp_path / "evaluations.jsonl"
+    files.append_rows(path, [EVALUATIONS[0], {**EVALUATIONS[1], **row} if row else {}])
+    assert len(EvaluationsFile(path).rows) == 1
+
+
 @pytest.mark.parametrize("seeds", [1, 3])
-def test_the_learning_curve_is_drawn_with_and_without_returns(seeds, tmp_path):
-    rows = [{"steps": 10 * i, "seed": s, "episode_return": None if i < 3 else math.log(i + s)} for i in range(1, 20) for s in range(seeds)]
-    plots.save(plots.learning_curve(rows, "title"), tmp_path / "curve.png")
-    image = imread(tmp_path / "curve.png")
-    assert image.shape[0] > 300
-    assert image[..., :3].min() < 0.5
-    plots.save(plots.learning_curve(rows[:seeds], "title"), tmp_path / "none.png")
-    assert [p.name for p in sorted(tmp_path.iterdir())] == ["curve.png", "none.png"]
+def test_the_learning_curve_is_drawn_with_and_without_returns_and_evaluations(seeds, tmp_path):
+    returns = np.log(np.arange(1.0, 20)[:, None] + np.arange(seeds))
+    returns[:3] = np.nan
+    dots = np.array([[100, 2.0, 0.5], [150, 3.0, 0.1]])
+    images = []
+    for name, figure in (
+        ("none", plots.learning_curve(np.arange(1, 4), returns[:3], "title")),
+        ("curve", plots.learning_curve(10 * np.arange(1, 20), returns, "title")),
+        ("dots", plots.learning_curve(10 * np.arange(1, 20), returns, "title", dots)),
+    ):
+        plots.save(figure, tmp_path / f"{name}.png")
+        images.append(imread(tmp_path / f"{name}.png")[..., :3])
+
+    def share(image, red, green, blue):
+        return np.mean(np.abs(image - np.array([red, green, blue]) / 255).max(-1) < 0.1)
+
+    blue, orange = (31, 119, 180), (255, 127, 14)
+    assert [share(image, *blue) > 0.001 for image in images[1:]] == [True, True]
+    assert [share(image, *orange) > 0.0001 for image in images] == [False, False, True]
+    assert [p.name for p in sorted(tmp_path.iterdir())] == ["curve.png", "dots.png", "none.png"]
 
 
 def test_an_incident_can_be_replayed_from_its_file(state, tmp_path):
@@ -140,13 +198,17 @@ def test_an_incident_can_be_replayed_from_its_file(state, tmp_path):
             incident=(type(state.episodes.incident[0])(qpos.at[0, 2].set(9), *rest), state.episodes.incident[1] + 0.5)
         )
     )
-    _save_incidents(broken, [{"seed": 0, "steps": 64, "nonfinite": 0}, {"seed": 0, "steps": 128, "nonfinite": 2}], tmp_path / "nonfinite")
-    saved = np.load(tmp_path / "nonfinite" / "steps_000000000128_seed_0.npz")
-    assert set(saved) == {"qpos", "qvel", "warmstart", "torso", "contact", "action"}
+    record = Record(tmp_path, SMALL, RunOptions(debug_nonfinite=True), 0)
+    row = {"episode_return": np.zeros((2, 1)), "nonfinite": np.array([[0.0], [2.0]])}
+    record.append(broken, row, 1)
+    assert not (tmp_path / "nonfinite").exists()
+    record.append(broken, jax.tree.map(lambda x: x[1:], row), 1)
+    incident = np.load(tmp_path / "nonfinite" / "steps_000000000128_seed_0.npz")
+    assert set(incident) == {"qpos", "qvel", "warmstart", "torso", "contact", "action"}
     env = make_task(SMALL)
-    replayed = env.set_state(env.reset(jax.random.key(0)), saved["qpos"], saved["qvel"])
+    replayed = env.set_state(env.reset(jax.random.key(0)), incident["qpos"], incident["qvel"])
     assert float(replayed.pipeline_state.qpos[2]) == 9
-    np.testing.assert_array_equal(saved["action"], 0.5)
+    np.testing.assert_array_equal(incident["action"], 0.5)
 
 
 def test_a_run_directory_says_what_the_run_is(tmp_path):
@@ -181,7 +243,7 @@ def test_a_config_file_that_is_none_is_refused(text, tmp_path):
 
 
 def test_a_config_file_with_an_impossible_value_is_refused(tmp_path):
-    run_directory.write_json(tmp_path / "config.json", to_dict(dataclasses.replace(SMALL, env="hoper")))
+    files.write_json(tmp_path / "config.json", to_dict(dataclasses.replace(SMALL, env="hoper")))
     with pytest.raises(ConfigError, match=r"config\.json: --env hoper: must be one of"):
         run_directory.read_config(tmp_path)
 

@@ -53,7 +53,7 @@ def _name_of(steps: int) -> str:
 
 def found(directory: Path) -> list[Path]:
     """The checkpoints in a directory, oldest first; no link is followed."""
-    named = (p for p in directory.glob("steps_*.msgpack") if re.fullmatch(r"steps_\d{12,18}\.msgpack", p.name))
+    named = (p for p in directory.glob("steps_*.msgpack") if re.fullmatch(r"steps_\d{12}\.msgpack", p.name))
     return sorted(p for p in named if p.is_file() and not p.is_symlink())
 
 

@@ -73,7 +73,7 @@ def _compare(config: Config, saved: Config, run_dir: Path, inexact: bool) -> Non
         ours, theirs = changed["physics"]
         print(f"warning: physics {ours} (was {theirs}): one step differs by up to 1e-4, so the rest is another sample", file=sys.stderr)
     if elsewhere:
-        print(f"warning: {elsewhere}: one operation differs by up to 1e-6, so the rest is another sample", file=sys.stderr)
+        print(f"warning: {elsewhere}: rounding differs, by up to 1e-6 relative per operation, so the rest is another sample", file=sys.stderr)
 
 
 def _last_state(run_dir: Path, config: Config) -> TrainState | None:
