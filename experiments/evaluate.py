@@ -1,5 +1,6 @@
 """Evaluate a trained run: python experiments/evaluate.py RUN_DIR --engine gymnasium --episodes 100"""
 
+import os
 import sys
 from dataclasses import dataclass
 from pathlib import Path
@@ -42,6 +43,8 @@ def main() -> int:
     if arguments.out and (arguments.out.is_dir() or not arguments.out.absolute().parent.is_dir()):
         cli.fail(f"--out {arguments.out}: must be a file in a directory that exists")
     out = arguments.out or arguments.run_dir / f"evaluation-{arguments.engine}.json"
+    if arguments.run_dir.is_dir() and not os.access(out.absolute().parent, os.W_OK):
+        cli.fail(f"--out {out}: must be a file that can be written")
     try:
         config = run_directory.read_config(arguments.run_dir)
         how = {"which": arguments.checkpoint, "engine": arguments.engine, "episodes": arguments.episodes, "seed": arguments.seed}

@@ -96,7 +96,7 @@ def test_any_bytes_are_evaluations_as_far_as_they_are_rows(tmp_path_factory, cut
     path = tmp_path_factory.mktemp("evaluations") / "evaluations.jsonl"
     path.write_bytes(ROWS[:cut] + tail)
     file = EvaluationsFile(path)
-    file.cut(steps)
+    file.cut(steps, 1)
     assert EvaluationsFile(path).rows == file.rows
     assert file.best is None or file.best <= steps
     assert file.points().shape == (len(file.rows), 3)

@@ -116,11 +116,11 @@ def test_in_float64_mjx_differs_from_c_mujoco_by_rounding(name):
 
 def test_worlds_in_blocks_and_under_nested_vmaps_move_as_each_alone():
     physics, (qpos, qvel, _, ctrl) = mjx(load_spec("hopper.xml"), 4), map(jnp.asarray, states("hopper"))
-    many = [jnp.concatenate([x, x, x]) for x in (qpos, qvel, ctrl)]  # three blocks
+    many = [jnp.concatenate([x, x, x])[:-1] for x in (qpos, qvel, ctrl)]  # three blocks, the last not full
     step = jax.jit(jax.vmap(lambda q, v, u: physics.step(physics.at_pose(q, v), u)))
     blocks, one = step(*many), step(qpos, qvel, ctrl)
     nested = jax.jit(jax.vmap(jax.vmap(lambda q, v: physics.step(physics.at_pose(q, v), ctrl[0]))))
-    assert_allclose(blocks.qvel, jnp.concatenate([one.qvel] * 3), atol=1e-5)
+    assert_allclose(blocks.qvel, jnp.concatenate([one.qvel] * 3)[:-1], atol=1e-5)
     folded = nested(qpos.reshape(8, 16, -1), qvel.reshape(8, 16, -1)).qvel.reshape(COUNT, -1)
     assert_allclose(folded, step(qpos, qvel, jnp.broadcast_to(ctrl[0], ctrl.shape)).qvel, atol=1e-5)
 

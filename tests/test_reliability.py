@@ -1,15 +1,18 @@
 """Nothing is lost on the way: runs that are stopped, killed, damaged or broken."""
 
+import contextlib
 import dataclasses
 import json
 import os
 import random
+import resource
 import shutil
 import signal
 import subprocess
 import sys
 import tempfile
 import time
+from functools import cache
 from pathlib import Path
 
 import jax.numpy as jnp
@@ -17,8 +20,12 @@ import pytest
 
 import dgae_jax as dg
 from dgae_jax.config import ConfigError
-from dgae_jax.io import checkpoint, metrics, run_directory
-from dgae_jax.io.training import RunOptions, resume, train
+from dgae_jax.io import checkpoint, files, metrics, run_directory, training
+from dgae_jax.io import record as record_module
+from dgae_jax.io.evaluation import evaluate_run
+from dgae_jax.io.options import RunOptions
+from dgae_jax.io.record import Record
+from dgae_jax.io.training import resume, train
 from tests.test_experiments import ROOT, TINY
 from tests.test_train import SMALL
 
@@ -28,11 +35,21 @@ QUIET = RunOptions(
 )
 
 
-def small(algo, physics="native"):
+@pytest.fixture(scope="module", autouse=True)
+def _compiled_once():
+    """Runs of the same configuration share their program, which JAX does not keep for `native`."""
+    with pytest.MonkeyPatch.context() as patch:
+        for make in (training.make_task, training.make_trainer):
+            patch.setattr(training, make.__name__, cache(make))
+        yield
+
+
+def small(algo, physics="native", seeds=1):
     policy = dg.PolicyConfig(hidden=(8,)) if "trpo" in algo else SMALL.policy
     critic = SMALL.critic if algo[0] == "d" else dataclasses.replace(SMALL.critic, quantiles=64)
     steps = ITERATIONS * SMALL.samples
-    return dataclasses.replace(SMALL, algo=algo, physics=physics, total_steps=steps, episode_length=20, policy=policy, critic=critic)
+    shape = {"total_steps": steps, "episode_length": 20, "num_seeds": seeds}
+    return dataclasses.replace(SMALL, algo=algo, physics=physics, policy=policy, critic=critic, **shape)
 
 
 def timeless(run_dir):
@@ -56,22 +73,24 @@ slow = pytest.mark.slow
 
 
 @pytest.mark.parametrize(
-    ("algo", "physics"),
+    ("algo", "physics", "seeds"),
     [
-        ("dtrpo", "native"),
-        *(pytest.param(algo, "native", marks=slow) for algo in ("ppo", "dppo", "trpo", "a2c", "da2c")),
-        pytest.param("dppo", "mjx", marks=slow),
+        ("dtrpo", "native", 1),
+        ("ppo", "native", 3),
+        *(pytest.param(algo, "native", 1, marks=slow) for algo in ("ppo", "dppo", "trpo", "a2c", "da2c")),
+        pytest.param("dppo", "mjx", 1, marks=slow),
     ],
 )
-def test_a_run_that_stopped_half_way_ends_with_the_same_bits_and_the_same_metrics(algo, physics, tmp_path):
-    whole, half, config = tmp_path / "whole", tmp_path / "half", small(algo, physics)
+def test_a_run_that_stopped_half_way_ends_with_the_same_bits_and_the_same_metrics(algo, physics, seeds, tmp_path):
+    whole, half, config = tmp_path / "whole", tmp_path / "half", small(algo, physics, seeds)
     assert train(config, dataclasses.replace(QUIET, run_dir=whole)) == 0
     stopped_half_way(whole, half)
     assert resume(config, dataclasses.replace(QUIET, resume=half)) == 0
     assert last(half).read_bytes() == last(whole).read_bytes()
     assert timeless(half) == timeless(whole)
-    evaluations = [json.loads((d / "evaluation.json").read_text()) for d in (whole, half)]
-    assert evaluations[0] == evaluations[1]
+    for name in ("evaluation.json", "evaluations.jsonl"):
+        assert (half / name).read_bytes() == (whole / name).read_bytes()
+    assert len(metrics.read(whole / "evaluations.jsonl")) == 2 * seeds
 
 
 @pytest.fixture(scope="module")
@@ -105,9 +124,185 @@ def test_a_finished_run_may_be_given_a_larger_budget(finished, tmp_path):
     assert run_directory.read_config(longer).total_steps == config.total_steps
 
 
-def test_a_directory_in_use_is_refused_and_left_alone(finished):
-    with run_directory.locked(finished), pytest.raises(ConfigError, match="another process is training there"):
-        resume(small("ppo"), dataclasses.replace(QUIET, resume=finished))
+@pytest.fixture
+def run_dir(finished, tmp_path):
+    """A copy of the finished run."""
+    shutil.copytree(finished, tmp_path / "run")
+    return tmp_path / "run"
+
+
+def test_a_budget_below_what_is_done_is_refused(finished):
+    config = dataclasses.replace(small("ppo"), total_steps=7 * 64)
+    with pytest.raises(ConfigError, match="--total-steps 448: must be at least the 512 that are done"):
+        resume(config, dataclasses.replace(QUIET, resume=finished))
+
+
+def test_a_directory_in_use_is_refused_and_left_alone_also_while_its_configuration_is_rewritten(run_dir):
+    with run_directory.locked(run_dir):
+        run_directory.write_config(run_dir, run_directory.read_config(run_dir))
+        with pytest.raises(ConfigError, match="another process is training there"):
+            resume(small("ppo"), dataclasses.replace(QUIET, resume=run_dir))
+    with run_directory.locked(run_dir):
+        pass
+
+
+@pytest.mark.parametrize(("path", "value"), [(("cores",), 99), (("device",), "tpu: v9"), (("versions", "jaxlib"), "0.0.1")])
+def test_another_machine_or_version_is_refused_by_both_values_unless_asked_for_and_then_warned_of(path, value, run_dir, capsys):
+    manifest = json.loads((run_dir / "manifest.json").read_text())
+    (manifest if len(path) == 1 else manifest[path[0]])[path[-1]] = value
+    files.write_json(run_dir / "manifest.json", manifest)
+    with pytest.raises(ConfigError, match=rf"must go on where it began, or with --inexact; now {path[-1]} .* \(was {value}\)"):
+        resume(small("ppo"), dataclasses.replace(QUIET, resume=run_dir))
+    assert resume(small("ppo"), dataclasses.replace(QUIET, resume=run_dir, inexact=True)) == 0
+    assert f"(was {value}): rounding differs, by up to 1e-6 relative" in capsys.readouterr().err
+    assert resume(small("ppo"), dataclasses.replace(QUIET, resume=run_dir)) == 0  # where it was last
+
+
+def test_physics_may_change_if_asked_for_with_a_warning_that_names_the_tolerance(run_dir, capsys):
+    other = dataclasses.replace(small("ppo", "mjx"), total_steps=9 * 64)
+    assert resume(other, dataclasses.replace(QUIET, resume=run_dir, inexact=True)) == 0
+    assert "warning: physics mjx (was native): one step differs by up to 1e-4" in capsys.readouterr().err
+    assert run_directory.read_config(run_dir).physics == "mjx"
+
+
+def test_the_best_checkpoint_stays_and_can_be_evaluated(tmp_path):
+    config, run_dir = small("ppo"), tmp_path / "run"
+    options = dataclasses.replace(QUIET, run_dir=run_dir, checkpoint_every=64, keep_checkpoints=1)
+    scores = iter([1.0, 5.0, 3.0, 5.0, 2.0, 2.0, 2.0, 2.0])
+    honest = record_module.evaluate_state
+
+    def scored(state, config, **how):
+        score = {"seed": 0, "return_mean": next(scores), "return_std": 0.0}
+        return {**honest(state, config, **how), "seeds": [score]}
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(record_module, "evaluate_state", scored)
+        assert train(config, options) == 0
+    assert [p.name for p in checkpoint.found(run_dir / "checkpoints")] == [f"steps_{steps:012d}.msgpack" for steps in (256, 512)]
+    found = {which: evaluate_run(run_dir, config, which=which, engine="gymnasium", episodes=1) for which in ("best", "newest")}
+    assert [found[which]["checkpoint"] for which in ("best", "newest")] == ["steps_000000000256.msgpack", "steps_000000000512.msgpack"]
+    assert found["newest"]["returns"] == json.loads((run_dir / "evaluation.json").read_text())["returns"]
+
+
+def test_the_best_checkpoint_of_a_run_without_evaluations_is_refused(run_dir):
+    (run_dir / "evaluations.jsonl").unlink()
+    with pytest.raises(ConfigError, match=r"--checkpoint best: must be newest: .* has no evaluations"):
+        evaluate_run(run_dir, small("ppo"), which="best", engine="gymnasium", episodes=1)
+
+
+@pytest.mark.parametrize("evaluation", [1, 2])
+@pytest.mark.parametrize(("kind", "code"), [(signal.SIGTERM, 143), (signal.SIGINT, 130)])
+def test_a_signal_in_an_evaluation_breaks_it_off_and_the_run_goes_on_later_to_the_same_end(
+    kind, code, evaluation, finished, tmp_path, capsys
+):
+    run_dir, config, calls = tmp_path / "run", small("ppo"), []
+
+    def interrupted(*args, **how):
+        calls.append(how)
+        if len(calls) == evaluation:
+            signal.raise_signal(kind)
+            pytest.fail("the evaluation went on")
+        return honest(*args, **how)
+
+    honest = record_module.evaluate_state
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(record_module, "evaluate_state", interrupted)
+        assert train(config, dataclasses.replace(QUIET, run_dir=run_dir)) == code
+    assert f"stopped by {kind.name}; continue with --resume {run_dir}" in capsys.readouterr().out
+    assert len(calls) == evaluation
+    assert not (run_dir / "evaluation.json").exists()
+    assert resume(config, dataclasses.replace(QUIET, resume=run_dir)) == 0
+    assert last(run_dir).read_bytes() == last(finished).read_bytes()
+    assert timeless(run_dir) == timeless(finished)
+    assert (run_dir / "evaluations.jsonl").read_bytes() == (finished / "evaluations.jsonl").read_bytes()
+
+
+def test_a_directory_that_vanishes_while_it_trains_ends_the_run_in_one_line(tmp_path, capsys):
+    run_dir, honest = tmp_path / "run", Record.append
+
+    def append(record, *args):
+        if record.steps == 64:  # no checkpoint yet, nothing on its way
+            shutil.rmtree(run_dir)
+        return honest(record, *args)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Record, "append", append)
+        assert train(small("ppo"), dataclasses.replace(QUIET, run_dir=run_dir)) == 1
+    error = f"stopped: {run_dir}/metrics.jsonl: cannot be written (No such file or directory); there is no checkpoint\n"
+    assert capsys.readouterr().err == error
+    assert not run_dir.exists()
+
+
+@contextlib.contextmanager
+def no_file_larger_than(size):
+    """The operating system refuses to write more, as on a full disk."""
+    usual = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, usual[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, usual)
+
+
+@pytest.mark.parametrize(("name", "share"), [("checkpoints/steps_000000000256.msgpack", 0.9), ("curve.png", 1.1)])
+def test_a_disk_that_takes_no_more_ends_the_run_in_one_line_and_it_goes_on_later_to_the_same_end(name, share, finished, tmp_path, capsys):
+    run_dir, size = tmp_path / "run", last(finished).stat().st_size
+    assert (finished / "metrics.jsonl").stat().st_size < 0.9 * size < 1.1 * size < (finished / "curve.png").stat().st_size
+    with no_file_larger_than(int(share * size)):
+        assert train(small("ppo"), dataclasses.replace(QUIET, run_dir=run_dir)) == 1
+    left = f"continue from {last(run_dir).name} with --resume {run_dir}" if share > 1 else "there is no checkpoint"
+    assert capsys.readouterr().err == f"stopped: {run_dir}/{name}: cannot be written (File too large); {left}\n"
+    assert not list(run_dir.rglob("*.part"))
+    assert resume(small("ppo"), dataclasses.replace(QUIET, resume=run_dir)) == 0
+    assert last(run_dir).read_bytes() == last(finished).read_bytes()
+    assert timeless(run_dir) == timeless(finished)
+
+
+@contextlib.contextmanager
+def without_rights(directory):
+    """As somebody who may read the directory at most, also where the tests are run by root."""
+    user = os.geteuid()
+    directory.chmod(0o500)
+    os.seteuid(user or 65534)
+    try:
+        yield
+    finally:
+        os.seteuid(user)
+        directory.chmod(0o700)
+
+
+def test_a_directory_that_cannot_be_written_is_one_clear_line(run_dir):
+    with without_rights(run_dir), pytest.raises(ConfigError, match=r"--run-dir .*below: must be a directory that can be written \(Perm"):
+        train(small("ppo"), dataclasses.replace(QUIET, run_dir=run_dir / "below"))
+    with without_rights(run_dir), pytest.raises(ConfigError, match="Permission denied"):
+        resume(small("ppo"), dataclasses.replace(QUIET, resume=run_dir))
+
+
+@pytest.mark.parametrize("name", ["config.json", "metrics.jsonl", "evaluations.jsonl", "checkpoints"])
+def test_a_run_directory_with_a_link_where_it_would_write_is_refused_and_nothing_is_touched(name, run_dir, tmp_path):
+    (run_dir / name).rename(tmp_path / "outside")
+    (run_dir / name).symlink_to(tmp_path / "outside")
+    before = sorted((p, p.lstat().st_mtime_ns) for p in tmp_path.rglob("*"))
+    with pytest.raises(ConfigError, match=rf"run/{name}: must be in the run directory itself, not a link or a device"):
+        resume(run_directory.read_config(run_dir), dataclasses.replace(QUIET, resume=run_dir))
+    assert sorted((p, p.lstat().st_mtime_ns) for p in tmp_path.rglob("*")) == before
+
+
+def test_a_pipe_in_place_of_a_file_is_refused_and_does_not_hang(run_dir):
+    (run_dir / "config.json").unlink()
+    os.mkfifo(run_dir / "config.json")
+    with pytest.raises(ConfigError, match="not a link or a device"):
+        run_directory.read_config(run_dir)
+
+
+@pytest.mark.parametrize("name", ["curve.png", "curve.png.part", "evaluation.json", "manifest.json.part"])
+def test_links_where_whole_files_are_written_are_replaced_and_not_followed(name, run_dir, tmp_path):
+    (tmp_path / "outside").write_text("mine")
+    (run_dir / name).unlink(missing_ok=True)
+    (run_dir / name).symlink_to(tmp_path / "outside")
+    assert resume(small("ppo"), dataclasses.replace(QUIET, resume=run_dir)) == 0
+    assert (tmp_path / "outside").read_text() == "mine"
+    assert not (run_dir / name).is_symlink()
 
 
 def test_updates_that_are_not_finite_are_left_out_and_counted_and_end_the_run_when_there_is_no_other(tmp_path, capsys):
@@ -184,17 +379,7 @@ def test_a_signal_saves_within_half_a_minute_and_a_second_one_ends_at_once(kind,
     assert int(state.iteration[0]) >= 1
 
 
-@pytest.mark.skipif(os.geteuid() == 0, reason="root writes anywhere")
-def test_a_directory_that_cannot_be_written_is_one_clear_line(finished):
-    finished.chmod(0o500)
-    try:
-        with pytest.raises(ConfigError, match="must be a directory that can be written"):
-            train(small("ppo"), dataclasses.replace(QUIET, run_dir=finished / "below"))
-    finally:
-        finished.chmod(0o700)
-
-
 def test_the_public_way_to_a_preset_and_back_through_a_file_is_the_same_configuration(tmp_path):
     config = dg.preset("paper", "dtrpo", "ant")
-    run_directory.write_json(tmp_path / "config.json", dataclasses.asdict(config))
+    files.write_json(tmp_path / "config.json", dataclasses.asdict(config))
     assert run_directory.read_config_file(tmp_path / "config.json") == config

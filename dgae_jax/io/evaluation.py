@@ -3,6 +3,7 @@
 import contextlib
 import dataclasses
 import warnings
+from collections import Counter
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -60,9 +61,10 @@ class EvaluationsFile:
         with contextlib.suppress(OSError):
             self.rows = [row for row, _ in files.whole_rows(path) if _is_evaluation(row)]
 
-    def cut(self, steps: int) -> None:
-        """Forget what followed the first `steps` samples."""
-        self.rows = [row for row in self.rows if row["steps"] <= steps]
+    def cut(self, steps: int, runs: int) -> None:
+        """Forget what followed the first `steps` samples, and evaluations that lack some of the `runs`."""
+        rows_at = Counter(row["steps"] for row in self.rows)
+        self.rows = [row for row in self.rows if row["steps"] <= steps and rows_at[row["steps"]] == runs]
         files.replace(self.path, files.json_lines(self.rows))
 
     def has(self, steps: int) -> bool:
@@ -89,7 +91,9 @@ class EvaluationsFile:
 def _is_evaluation(row: dict[str, Any]) -> bool:
     """A file may hold anything."""
     steps, *numbers = (row.get(name) for name in ("steps", "seed", "return_mean", "return_std"))
-    return type(steps) is int and 0 <= steps < 2**53 and all(isinstance(x, float | int) and abs(x) < 1e30 for x in numbers)
+    if not (type(steps) is int and 0 <= steps < 2**53 and all(isinstance(x, float | int) and abs(x) < 1e30 for x in numbers)):
+        return False
+    return row["return_std"] >= 0
 
 
 def referee(config: Config) -> str:

@@ -34,9 +34,11 @@ def json_lines(rows: Iterable[dict[str, Any]]) -> bytes:
 
 
 def append_rows(path: Path, rows: Iterable[dict[str, Any]]) -> None:
-    """Add rows to a file of JSON lines."""
+    """Add rows to a file of JSON lines; they are on the disk, ahead of whatever is written next, when this returns."""
     with _named(path), path.open("ab") as file:
         file.write(json_lines(rows))
+        file.flush()
+        os.fsync(file.fileno())
 
 
 def whole_rows(path: Path) -> Iterator[tuple[dict[str, Any], int]]:

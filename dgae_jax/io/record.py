@@ -1,5 +1,6 @@
 """What a run leaves in its directory while it trains: metrics, checkpoints, evaluations, a curve."""
 
+import gc
 import time
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -31,7 +32,7 @@ class Record:
         (run_dir / "checkpoints").mkdir(exist_ok=True)
         self.metrics = MetricsFile(run_dir / "metrics.jsonl", config, done)
         self.evaluations = EvaluationsFile(run_dir / "evaluations.jsonl")
-        self.evaluations.cut(done * config.samples)
+        self.evaluations.cut(done * config.samples, config.num_seeds)
         self.began = time.monotonic() - self.metrics.seconds
         self.beside, self.pending = ThreadPoolExecutor(1), Future()
         self.pending.set_result(None)
@@ -83,8 +84,7 @@ class Record:
     def draw(self) -> None:
         """The learning curve so far."""
         title = f"{self.config.env}-{self.config.env_version}, {self.config.algo}, {self.config.physics}"
-        figure = plots.learning_curve(*self.metrics.curve(), title, self.evaluations.points())
-        self._write(plots.save, figure, self.run_dir / "curve.png")
+        self._write(_plot, self.run_dir / "curve.png", *self.metrics.curve(), title, self.evaluations.points())
 
     def _save_incidents(self, state: TrainState, seeds: set[int]) -> None:
         """The last state and action from which a world turned non-finite, per run and dispatch: arrays by name, and action."""
@@ -95,3 +95,8 @@ class Record:
             directory = self.run_dir / "nonfinite"
             directory.mkdir(exist_ok=True)
             np.savez(directory / f"steps_{self.steps:012d}_seed_{seed}.npz", **arrays, action=action)
+
+
+def _plot(path: Path, *curve) -> None:
+    plots.save(plots.learning_curve(*curve), path)
+    gc.collect()  # a figure is full of cycles, and left alone figures gather: 3 MB each

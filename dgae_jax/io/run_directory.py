@@ -6,6 +6,7 @@
 import contextlib
 import fcntl
 import json
+import stat
 import sys
 import time
 from collections.abc import Iterator
@@ -58,12 +59,13 @@ def _lock(file) -> None:
 
 
 def read_config(path: Path) -> Config:
-    """The configuration of a run; raises ConfigError if `path` is not a run directory, or one with links in it."""
-    config = read_config_file(path / "config.json")
-    for name in ("metrics.jsonl", "evaluations.jsonl", "checkpoints"):  # what a run goes on to write
-        if (path / name).is_symlink():
-            raise ConfigError(f"{path / name}: must not be a symbolic link")
-    return config
+    """The configuration of a run; raises ConfigError if `path` is not a run directory, or one with links or devices in it."""
+    for name in ("config.json", "manifest.json", "metrics.jsonl", "evaluations.jsonl", "checkpoints", "nonfinite"):
+        with contextlib.suppress(OSError):  # what is missing is missed by those who need it
+            mode = (path / name).lstat().st_mode
+            if not (stat.S_ISREG(mode) or stat.S_ISDIR(mode)):
+                raise ConfigError(f"{path / name}: must be in the run directory itself, not a link or a device")
+    return read_config_file(path / "config.json")
 
 
 def read_config_file(path: Path) -> Config:

@@ -71,9 +71,13 @@ def _compare(config: Config, saved: Config, run_dir: Path, inexact: bool) -> Non
         raise ConfigError(f"--resume {run_dir}: must go on where it began, or with --inexact; now {elsewhere}")
     if "physics" in changed:
         ours, theirs = changed["physics"]
-        print(f"warning: physics {ours} (was {theirs}): one step differs by up to 1e-4, so the rest is another sample", file=sys.stderr)
+        _warn_of_another_sample(f"physics {ours} (was {theirs}): one step differs by up to 1e-4")
     if elsewhere:
-        print(f"warning: {elsewhere}: rounding differs, by up to 1e-6 relative per operation, so the rest is another sample", file=sys.stderr)
+        _warn_of_another_sample(f"{elsewhere}: rounding differs, by up to 1e-6 relative per operation")
+
+
+def _warn_of_another_sample(reason: str) -> None:
+    print(f"warning: {reason}, so the rest is another sample", file=sys.stderr)
 
 
 def _last_state(run_dir: Path, config: Config) -> TrainState | None:
@@ -166,7 +170,7 @@ def _broke_down(state: TrainState, run_dir: Path) -> int:
 
 def _cannot_write(reason: OSError, run_dir: Path) -> int:
     saved = checkpoint.found(run_dir / "checkpoints")
-    left = f"continue from {saved[-1].name} with --resume {run_dir}" if saved else "there is no checkpoint yet"
+    left = f"continue from {saved[-1].name} with --resume {run_dir}" if saved else "there is no checkpoint"
     print(f"stopped: {reason.filename or 'output'}: cannot be written ({reason.strerror}); {left}", file=sys.stderr)
     return 1
 
