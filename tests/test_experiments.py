@@ -55,7 +55,7 @@ def trained(tmp_path_factory):
 def test_training_writes_a_whole_run_directory(trained):
     directory, _, _ = trained
     assert {p.name for p in directory.iterdir()} == {
-        "config.json", "manifest.json", "metrics.jsonl", "checkpoints", "curve.png", "evaluation.json",
+        "config.json", "manifest.json", "metrics.jsonl", "evaluations.jsonl", "checkpoints", "curve.png", "evaluation.json",
     }  # fmt: skip
     assert (directory / "curve.png").read_bytes().startswith(b"\x89PNG")
     config = json.loads((directory / "config.json").read_text())
@@ -88,11 +88,22 @@ def test_the_last_line_is_the_return_in_gymnasium_and_where_the_files_are(traine
     )
 
 
-def test_checkpoints_are_saved_along_the_way_and_at_the_end(trained):
+def test_checkpoints_are_saved_and_evaluated_along_the_way_and_at_the_end(trained):
     directory, _, _ = trained
-    assert [p.name for p in sorted((directory / "checkpoints").iterdir())] == [
-        "steps_000000000512.msgpack", "steps_000000000768.msgpack", "steps_000000000960.msgpack",
-    ]  # fmt: skip
+    evaluations = metrics.read(directory / "evaluations.jsonl")
+    assert [row["steps"] for row in evaluations] == [256, 512, 768, 960]
+    best = max(evaluations[:-1], key=lambda row: (row["return_mean"], row["steps"]))["steps"]
+    kept = sorted({best, 512, 768, 960})
+    assert [p.name for p in sorted((directory / "checkpoints").iterdir())] == [f"steps_{steps:012d}.msgpack" for steps in kept]
+
+
+def test_the_best_checkpoint_is_evaluated_if_asked_for(trained, run, tmp_path):
+    rows = metrics.read(trained[0] / "evaluations.jsonl")
+    code, _, _ = run("evaluate", trained[0], "--checkpoint", "best", "--episodes", 3, "--out", tmp_path / "best.json")
+    result = json.loads((tmp_path / "best.json").read_text())
+    assert code == 0
+    assert result["return_mean"] == pytest.approx(max(row["return_mean"] for row in rows))
+    assert result["checkpoint"] in {f"steps_{row['steps']:012d}.msgpack" for row in rows}
 
 
 @pytest.mark.parametrize("engine", ["gymnasium", "native"])
@@ -132,6 +143,9 @@ def test_evaluating_twice_gives_the_same_returns(trained, run, tmp_path):
         (["--cache-dir", "/dev/null/below"], r"--cache-dir /dev/null/below: must be a directory that can be written, or none"),
         (["--episodes", "0"], r"--episodes 0: must be a whole number of at least 1"),
         (["--checkpoint-every", "0"], r"--checkpoint-every 0: must be a whole number of at least 1"),
+        (["--keep-checkpoints", "0"], r"--keep-checkpoints 0: must be a whole number of at least 1"),
+        (["--num-seeds", "0"], r"--num-seeds 0: must be a whole number of at least 1"),
+        (["--inexact"], r"--inexact True: must be left out without --resume"),
     ],
 )  # fmt: skip
 def test_bad_input_is_one_line_on_stderr_and_exit_code_2(argv, message, run, monkeypatch, tmp_path):
@@ -154,7 +168,50 @@ def test_a_used_run_directory_is_refused_and_left_alone(trained, run):
 @pytest.mark.parametrize(
     ("argv", "message"),
     [
-        (["nowhere"], r"nowhere: must be a run directory with a config.json"),
+        (["--resume", "RUN", "--preset", "paper"], r"--preset paper: must be left out: all settings start from RUN"),
+        (["--resume", "RUN", "--config", "FILE"], r"--config FILE: must be left out: all settings start from RUN"),
+        (["--config", "FILE", "--preset", "paper"], r"--preset paper: must be left out: all settings start from FILE"),
+        (["--resume", "RUN", "--run-dir", "there"], r"--run-dir there: must be left out: --resume writes to RUN"),
+        (["--resume", "RUN", "--gamma", "0.5"], r"--gamma 0\.5: must be 0\.99 as in RUN, or left out"),
+    ],
+)
+def test_flags_that_would_have_no_effect_are_refused(argv, message, trained, run, monkeypatch, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    places = {"RUN": str(trained[0]), "FILE": str(trained[0] / "config.json")}
+    code, out, err = run("train", *(places.get(word, word) for word in argv), "--cache-dir", "none")
+    for name, place in sorted(places.items()):  # FILE first, which begins like RUN
+        err = err.replace(place, name)
+    assert (code, out) == (2, "")
+    assert re.fullmatch(rf"error: {message}\n", err)
+
+
+def test_a_device_that_is_not_there_is_refused_in_one_line(tmp_path):
+    done = subprocess.run(
+        [sys.executable, "experiments/train.py", "--run-dir", str(tmp_path / "run")], cwd=ROOT, capture_output=True, text=True,
+        env={**os.environ, "JAX_PLATFORMS": "abacus"},
+    )  # fmt: skip
+    assert (done.returncode, done.stdout) == (2, "")
+    assert re.fullmatch(r"error: JAX_PLATFORMS=abacus: must name a device that JAX finds here, cpu for one .*\n", done.stderr)
+    assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.parametrize(("name", "work"), [("train", "train"), ("evaluate", "evaluate_run")])
+def test_an_interrupt_where_nothing_is_at_stake_ends_with_130_and_one_line(name, work, trained, run, monkeypatch, tmp_path):
+    def interrupted(*_, **__):
+        raise KeyboardInterrupt
+
+    main = command(name)
+    monkeypatch.setitem(main.__globals__, work, interrupted)
+    monkeypatch.setattr(sys.modules[__name__], "command", lambda _: main)
+    code, out, err = run(name, *([trained[0]] if name == "evaluate" else ["--run-dir", tmp_path / "run"]))
+    assert (code, out) == (130, "")
+    assert re.fullmatch(r"stopped by SIGINT.*\n", err)
+
+
+@pytest.mark.parametrize(
+    ("argv", "message"),
+    [
+        (["nowhere"], r"nowhere/config.json: must be a configuration that can be read \(No such file or directory\)"),
         ([], r"RUN_DIR|PATH"),
         ([".", "--engine", "ode"], r"'ode'.*'gymnasium', 'native', 'mjx'"),
         ([".", "--episodes", "0"], r"--episodes 0: must be a whole number of at least 1"),
