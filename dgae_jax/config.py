@@ -216,7 +216,7 @@ def _value(value: Any, like: Any, path: str):
         ok = isinstance(value, list | tuple) and all(type(v) is int for v in value)
         value = tuple(value) if ok else value
     elif isinstance(like, float):
-        ok = type(value) in (int, float)
+        ok = type(value) is float or (type(value) is int and abs(value) < 2**53)
         value = float(value) if ok else value
     else:
         ok = type(value) is type(like)

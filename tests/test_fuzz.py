@@ -4,7 +4,9 @@ import contextlib
 import io
 import json
 
+import numpy as np
 import pytest
+from flax import serialization
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
@@ -64,6 +66,12 @@ def changed(data, path, value):
 PATHS = [(k,) for k in to_dict(dg.Config())] + [(p, k) for p in ("policy", "critic", "noise") for k in to_dict(dg.Config())[p]]
 
 
+@pytest.mark.parametrize("name", ["gamma", "total_steps", "seed"])
+def test_a_number_of_four_hundred_digits_is_refused(name):
+    with pytest.raises(ConfigError, match=name.replace("_", "[-_]")):
+        validate(from_dict({**to_dict(dg.Config()), name: 10**400}))
+
+
 @many
 @given(st.one_of(PLAIN, st.builds(lambda path, value: changed(to_dict(dg.Config()), path, value), st.sampled_from(PATHS), PLAIN)))
 def test_any_json_is_a_configuration_or_refused(data):
@@ -117,15 +125,16 @@ def test_any_manifest_is_another_machine_and_can_be_added_to(tmp_path_factory, d
     assert manifest.changes(run_dir) == []
 
 
-ARRAYS = b"\x82\xa1a\xc7\x0e\x01\x93\x91\x02\xa7float32\xc4\x08" + bytes(8) + b"\xa1b\xc3"
+BODY = serialization.msgpack_serialize({"arrays": {"a": np.ones(2, np.float32), "b": True}, "config": json.dumps(to_dict(dg.Config()))})
+FRONT = st.integers(0, 120)  # the arrays, the beginning of the configuration, and the header where there is one
 
 
 @many
-@given(st.booleans(), st.integers(0, 200), st.binary(max_size=60), st.integers(0, 200))
+@given(st.booleans(), FRONT, st.binary(max_size=60), FRONT | st.integers(0, len(BODY)))
 def test_any_bytes_are_a_checkpoint_or_refused_whether_they_carry_a_checksum_or_not(tmp_path_factory, honest, at, noise, rest):
     path = tmp_path_factory.mktemp("checkpoints") / "steps_000000000001.msgpack"
-    arrays = ARRAYS[:at] + noise + ARRAYS[rest:]
-    path.write_bytes(signed(arrays) if honest else (signed(ARRAYS)[:at] + noise + signed(ARRAYS)[rest:]))
+    body = BODY[:at] + noise + BODY[rest:]
+    path.write_bytes(signed(body) if honest else (signed(BODY)[:at] + noise + signed(BODY)[rest:]))
     with contextlib.suppress(CheckpointError):
         checkpoint._read(path)
 

@@ -28,7 +28,7 @@ def state():
 def saved(state, directory, steps, **keep):
     """A checkpoint of `state` after so many samples."""
     then = state._replace(iteration=jnp.full_like(state.iteration, steps // SMALL.samples))
-    return checkpoint.save(directory, checkpoint.arrays_of(then), steps, **keep)
+    return checkpoint.save(directory, SMALL, checkpoint.arrays_of(then), steps, **keep)
 
 
 def plain(state):
@@ -68,7 +68,7 @@ def test_the_newest_checkpoints_are_kept_and_the_best(state, tmp_path):
         (lambda b: b"\x93\x01\xa1a\x02", "is damaged"),
         (lambda b: b[:-9] + b"x" + b[-8:], "is damaged"),
         (lambda b: b.replace(b'"schema": 1', b'"schema": 2'), "has schema 2; this version reads schema 1"),
-        (lambda b: signed(b.partition(b"\n")[2].replace(b"critic", b"cretic")), "is of another run, cretic.* is unknown here"),
+        (lambda b: signed(b.partition(b"\n")[2].replace(b"critic.", b"cretic.")), "is of another run, cretic.* is unknown here"),
         (lambda b: signed(b"\x93\x01\xa1a\x02"), "is damaged"),
         (lambda b: signed(b"\x81\xa1a\xc1"), "is damaged"),
     ],
@@ -80,16 +80,39 @@ def test_a_damaged_checkpoint_is_refused_by_name(damage, reason, state, tmp_path
         checkpoint.load(path, SMALL)
 
 
-def test_a_checkpoint_of_another_network_size_is_refused_by_leaf_and_shapes(state, tmp_path):
+@pytest.mark.parametrize(
+    ("change", "reason"),
+    [
+        ({"env_version": "v5"}, r"its env_version is v4, here v5"),  # arrays of the same shapes
+        ({"env": "ant"}, r"its env is hopper, here ant"),
+        ({"policy": dataclasses.replace(SMALL.policy, hidden=(9,))}, r"its policy\.hidden is \(8,\), here \(9,\)"),
+    ],
+)
+def test_a_checkpoint_of_another_environment_or_network_is_refused_by_both_values(change, reason, state, tmp_path):
     path = saved(state, tmp_path, 64)
-    wider = dataclasses.replace(SMALL, policy=dataclasses.replace(SMALL.policy, hidden=(9,)))
-    with pytest.raises(CheckpointError, match=r"is of another run, policy\..* is float32\(1, 8, 3\), here float32\(1, 9, 3\)"):
-        checkpoint.load(path, wider)
+    with pytest.raises(CheckpointError, match=f"{path.name}: is of another run, {reason}"):
+        checkpoint.load(path, dataclasses.replace(SMALL, **change))
+    checkpoint.load(path, dataclasses.replace(SMALL, total_steps=9999, physics="mjx"))
+
+
+def test_arrays_of_other_shapes_are_refused_by_name_whatever_configuration_they_claim(state, tmp_path):
+    arrays = checkpoint.arrays_of(state)
+    name = next(name for name in arrays if name.startswith("policy.params"))
+    path = checkpoint.save(tmp_path, SMALL, {**arrays, name: np.zeros((2, 2), np.float16)}, 0)
+    with pytest.raises(CheckpointError, match=rf"is of another run, {name} is float16\(2, 2\), here float32\(1, "):
+        checkpoint.load(path, SMALL)
+
+
+def test_a_checkpoint_whose_configuration_has_other_names_is_of_another_version(state, tmp_path):
+    path = saved(state, tmp_path, 0)
+    path.write_bytes(signed(path.read_bytes().partition(b"\n")[2].replace(b"gamma", b"gemma")))
+    with pytest.raises(CheckpointError, match=r"is of another version \(gamma: missing\)"):
+        checkpoint.load(path, SMALL)
 
 
 def test_a_renamed_checkpoint_is_refused(state, tmp_path):
     path = saved(state, tmp_path, 64).rename(tmp_path / "steps_000000000128.msgpack")
-    with pytest.raises(CheckpointError, match="is of another run, or renamed: it was saved after 1 iterations"):
+    with pytest.raises(CheckpointError, match="is renamed, it was saved after 1 iterations"):
         checkpoint.load(path, SMALL)
 
 

@@ -11,7 +11,7 @@ import numpy as np
 from flax import serialization
 
 from dgae_jax.build import make_task, make_trainer, seed_keys
-from dgae_jax.config import Config
+from dgae_jax.config import Config, ConfigError, differences, from_dict, to_dict
 from dgae_jax.io import files
 from dgae_jax.types import TrainState
 
@@ -32,13 +32,13 @@ def arrays_of(state: TrainState) -> dict[str, np.ndarray]:
     return {name: np.array(x) for name, x in _plain(state).items()}
 
 
-def save(directory: Path, arrays: dict[str, np.ndarray], steps: int, keep: int = 3, best: int | None = None) -> Path:
+def save(directory: Path, config: Config, arrays: dict[str, np.ndarray], steps: int, keep: int = 3, best: int | None = None) -> Path:
     """Write `steps_….msgpack`, complete or not at all, and delete all but the newest `keep` and that of `best` steps.
 
-    The file is one line of JSON, with schema and checksum, and the arrays in msgpack.
+    The file is one line of JSON, with schema and checksum, and the configuration and the arrays in msgpack.
     """
     path = directory / _name_of(steps)
-    body = serialization.msgpack_serialize(arrays)
+    body = serialization.msgpack_serialize({"config": json.dumps(to_dict(config)), "arrays": arrays})
     header = {"schema": SCHEMA, "sha256": hashlib.sha256(body).hexdigest()}
     files.replace(path, json.dumps(header).encode() + b"\n" + body)
     for old in found(directory)[:-keep]:
@@ -82,7 +82,10 @@ def load(path: Path, config: Config) -> TrainState:
 
     Raises DamagedError if the file cannot be read whole, CheckpointError if it is of another run or a newer version.
     """
-    got = _read(path)
+    saved, got = _read(path)
+    for name, (ours, theirs) in differences(config, saved).items():
+        if name not in ("total_steps", "physics"):
+            raise CheckpointError(f"{path}: is of another run, its {name} is {theirs}, here {ours}")
     blank = jax.eval_shape(make_trainer(make_task(config), 1).init, config, seed_keys(config))
     want = jax.eval_shape(_plain, blank)
     for name in sorted(set(got) ^ set(want)):
@@ -93,7 +96,7 @@ def load(path: Path, config: Config) -> TrainState:
             raise CheckpointError(f"{path}: is of another run, {name} is {kind}, here {like.dtype}{like.shape}")
     for iteration in got["iteration"]:
         if path.name != _name_of(int(iteration) * config.samples):
-            raise CheckpointError(f"{path}: is of another run, or renamed: it was saved after {iteration} iterations")
+            raise CheckpointError(f"{path}: is renamed, it was saved after {iteration} iterations")
 
     def restored(path, like):
         leaf = jnp.asarray(got[_name(path)])
@@ -102,10 +105,10 @@ def load(path: Path, config: Config) -> TrainState:
     return jax.tree.map_with_path(restored, blank)
 
 
-def _read(path: Path) -> dict[str, np.ndarray]:
-    """The arrays by name. Nothing in the file is ever run, and only bytes that match their checksum are decoded."""
+def _read(path: Path) -> tuple[Config, dict[str, np.ndarray]]:
+    """Configuration, and arrays by name. Nothing in the file is ever run, and only bytes that match their checksum are decoded."""
     try:
-        first, _, arrays = path.read_bytes().partition(b"\n")
+        first, _, body = path.read_bytes().partition(b"\n")
     except OSError as reason:
         raise DamagedError(f"{path}: cannot be read ({reason.strerror})") from reason
     try:
@@ -115,10 +118,14 @@ def _read(path: Path) -> dict[str, np.ndarray]:
         raise DamagedError(f"{path}: is damaged (no header)") from None
     if schema != SCHEMA:
         raise CheckpointError(f"{path}: has schema {schema}; this version reads schema {SCHEMA}")
-    if hashlib.sha256(arrays).hexdigest() != checksum:
+    if hashlib.sha256(body).hexdigest() != checksum:
         raise DamagedError(f"{path}: is damaged (its checksum differs)")
     try:
-        return {str(name): np.asarray(array) for name, array in serialization.msgpack_restore(arrays).items()}
+        parts = serialization.msgpack_restore(body)
+        arrays = {str(name): np.asarray(array) for name, array in parts["arrays"].items()}
+        return from_dict(json.loads(str(parts["config"]))), arrays
+    except ConfigError as reason:
+        raise CheckpointError(f"{path}: is of another version ({reason})") from reason
     except Exception as reason:  # a hostile file may carry a valid checksum; the decoder raises many kinds
         raise DamagedError(f"{path}: is damaged ({type(reason).__name__})") from reason
 

@@ -70,7 +70,7 @@ class Record:
     def save(self, state: TrainState) -> None:
         """Write a checkpoint, from a copy: the state itself may be consumed meanwhile."""
         keep = self.options.keep_checkpoints, self.evaluations.best
-        self._write(checkpoint.save, self.run_dir / "checkpoints", checkpoint.arrays_of(state), self.steps, *keep)
+        self._write(checkpoint.save, self.run_dir / "checkpoints", self.config, checkpoint.arrays_of(state), self.steps, *keep)
 
     def evaluate(self, state: TrainState) -> dict[str, Any]:
         """Returns of the policies as they are now, noted and drawn."""
