@@ -63,11 +63,22 @@ def _now() -> dict[str, Any]:
         "git_revision": _git_revision(),
         "python": platform.python_version(),
         "platform": platform.platform(),
-        "device": f"{jax.default_backend()}: {jax.devices()[0].device_kind}",
+        "device": f"{jax.default_backend()}: {_model()}",
         "devices": jax.device_count(),
         "cores": _cores(),
         "versions": {name: _version(name) for name in _VERSIONS_OF},
     }
+
+
+def _model() -> str:
+    """Of the device; JAX calls every CPU the same, but compiles for the one it finds."""
+    if jax.default_backend() != "cpu":
+        return jax.devices()[0].device_kind
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+        return next(line.partition(":")[2].strip() for line in lines if line.startswith("model name"))
+    except (OSError, StopIteration):
+        return platform.processor() or platform.machine()
 
 
 def _cores() -> int | None:
