@@ -226,6 +226,14 @@ def test_the_learning_curve_is_drawn_with_and_without_returns_and_evaluations(se
     assert [p.name for p in sorted(tmp_path.iterdir())] == ["curve.png", "dots.png", "none.png"]
 
 
+def test_a_long_run_is_drawn_from_its_first_to_its_last_iteration_in_a_thousand_points():
+    steps = np.arange(1, 30_001)
+    line = plots.learning_curve(steps, np.sqrt(steps)[:, None], "title").axes[0].lines[0]
+    x, y = (np.asarray(each) for each in line.get_data())
+    assert (len(x), x[0], x[-1]) == (1000, 1, 30_000)
+    np.testing.assert_array_equal(y, np.sqrt(x))
+
+
 def test_an_incident_can_be_replayed_from_its_file(state, tmp_path):
     qpos, *rest = state.episodes.incident[0]
     broken = state._replace(

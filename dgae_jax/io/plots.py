@@ -8,9 +8,12 @@ from matplotlib.figure import Figure
 
 from dgae_jax.io import files
 
+POINTS = 1000
+"""Most points of a line, about as many as the picture has columns: plotting takes the same time and memory in a long run."""
+
 
 def learning_curve(steps: np.ndarray, returns: np.ndarray, title: str, evaluations: np.ndarray | None = None) -> Figure:
-    """Undiscounted episode returns [I, S] of S runs while training, over samples `steps` [I].
+    """Undiscounted episode returns [I, S] of S runs while training, over samples `steps` [I]; every so many if there are very many.
 
     A thin line per run, mean and standard deviation when there are several. `evaluations` [E, 3] are dots: samples, mean and
     standard deviation of the returns of the deterministic policy over all runs.
@@ -18,6 +21,8 @@ def learning_curve(steps: np.ndarray, returns: np.ndarray, title: str, evaluatio
     figure = Figure(figsize=(6.4, 4.0), layout="constrained", dpi=150)
     axes = figure.subplots()
     several = returns.shape[1] > 1
+    drawn = np.linspace(0, len(steps) - 1, min(len(steps), POINTS)).astype(int)
+    steps, returns = steps[drawn], returns[drawn]
     for run in returns.T:
         axes.plot(steps, run, color="tab:blue", linewidth=0.8 if several else 1.5, alpha=0.4 if several else 1)
     if several:
