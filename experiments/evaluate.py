@@ -40,8 +40,10 @@ def main() -> int:
         cli.fail(f"--episodes {arguments.episodes}: must be a whole number of at least 1")
     if not 0 <= arguments.seed < 2**31:
         cli.fail(f"--seed {arguments.seed}: must be a whole number from 0 to {2**31 - 1:,}")
-    if arguments.out and (arguments.out.is_dir() or not arguments.out.absolute().parent.is_dir()):
+    if arguments.out and not arguments.out.absolute().parent.is_dir():
         cli.fail(f"--out {arguments.out}: must be a file in a directory that exists")
+    if arguments.out and (arguments.out.is_symlink() or (arguments.out.exists() and not arguments.out.is_file())):
+        cli.fail(f"--out {arguments.out}: must be a file, not a directory, a link or a device")
     out = arguments.out or arguments.run_dir / f"evaluation-{arguments.engine}.json"
     if arguments.run_dir.is_dir() and not os.access(out.absolute().parent, os.W_OK):
         cli.fail(f"--out {out}: must be a file that can be written")
@@ -57,7 +59,7 @@ def main() -> int:
     except KeyboardInterrupt:
         print("stopped by SIGINT, nothing written", file=sys.stderr)
         return 130
-    print(f"{describe(result)}; written to {out}")
+    print(f"{describe(result)}, {result['checkpoint']}; written to {out}")
     return 0
 
 

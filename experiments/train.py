@@ -8,7 +8,7 @@ from typing import Annotated
 import tyro
 
 from dgae_jax import Config, ConfigError, presets
-from dgae_jax.io import cli, run_directory
+from dgae_jax.io import cli, manifest, run_directory
 from dgae_jax.io.checkpoint import CheckpointError
 from dgae_jax.io.options import RunOptions
 from dgae_jax.io.training import resume, train
@@ -32,9 +32,11 @@ def main() -> int:
     0 done; 1 broke down or could write no more; 2 bad input; 130 / 143 stopped by SIGINT / SIGTERM with a checkpoint saved.
     """
     try:
-        config = _start(**cli.peek(preset="", algo=Config.algo, env=Config.env, policy_update="default", config="", resume=""))
+        first = cli.peek(preset="", algo=Config.algo, env=Config.env, policy_update="default", config="", resume="")
+        config = _start(**first)
         description = "Train a policy on a MuJoCo task with PPO, TRPO, A2C or their distributional variants."
-        arguments = cli.parse(Arguments, description, default=Arguments(settings=config))
+        run = manifest.options(Path(first["resume"])) if first["resume"] else RunOptions()
+        arguments = cli.parse(Arguments, description, default=Arguments(settings=config, run=run))
         return (resume if arguments.run.resume else train)(arguments.settings, arguments.run)
     except (ConfigError, CheckpointError) as mistake:
         cli.fail(str(mistake))

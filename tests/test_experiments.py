@@ -208,6 +208,23 @@ def test_an_interrupt_where_nothing_is_at_stake_ends_with_130_and_one_line(name,
     assert re.fullmatch(r"stopped by SIGINT.*\n", err)
 
 
+def test_a_resumed_run_starts_from_its_own_flags(trained, monkeypatch):
+    main, got = command("train"), []
+    monkeypatch.setitem(main.__globals__, "resume", lambda config, options: got.append(options) or 0)
+    monkeypatch.setattr(sys, "argv", ["train.py", "--resume", str(trained[0]), "--episodes", "5"])
+    assert main() == 0
+    assert (got[0].checkpoint_every, got[0].episodes, got[0].keep_checkpoints) == (300, 5, 3)
+
+
+def test_an_output_that_is_no_file_is_left_alone(trained, run, tmp_path):
+    os.mkfifo(tmp_path / "pipe")
+    (tmp_path / "link").symlink_to(tmp_path / "pipe")
+    for name in ("pipe", "link", "."):
+        code, _, err = run("evaluate", trained[0], "--out", tmp_path / name)
+        assert (code, err) == (2, f"error: --out {tmp_path / name}: must be a file, not a directory, a link or a device\n")
+    assert (tmp_path / "pipe").is_fifo()
+
+
 @pytest.mark.parametrize(
     ("argv", "message"),
     [

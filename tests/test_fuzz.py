@@ -121,7 +121,7 @@ def test_any_manifest_is_another_machine_and_can_be_added_to(tmp_path_factory, d
     run_dir = tmp_path_factory.mktemp("manifest")
     (run_dir / "manifest.json").write_bytes(json.dumps(data).encode() + noise)
     assert manifest.changes(run_dir)
-    manifest.add(run_dir)
+    manifest.add(run_dir, manifest.options(run_dir))
     assert manifest.changes(run_dir) == []
 
 

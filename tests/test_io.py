@@ -69,6 +69,8 @@ def test_the_newest_checkpoints_are_kept_and_the_best(state, tmp_path):
         (lambda b: b[:-9] + b"x" + b[-8:], "is damaged"),
         (lambda b: b.replace(b'"schema": 1', b'"schema": 2'), "has schema 2; this version reads schema 1"),
         (lambda b: signed(b.partition(b"\n")[2].replace(b"critic.", b"cretic.")), "is of another run, cretic.* is unknown here"),
+        (lambda b: b.replace(b'"schema": 1', b'"schema": 1e999'), "is damaged"),
+        (lambda b: b.replace(b'"schema": 1', b'"schema": true'), "is damaged"),
         (lambda b: signed(b"\x93\x01\xa1a\x02"), "is damaged"),
         (lambda b: signed(b"\x81\xa1a\xc1"), "is damaged"),
     ],
@@ -110,6 +112,15 @@ def test_a_checkpoint_whose_configuration_has_other_names_is_of_another_version(
         checkpoint.load(path, SMALL)
 
 
+def test_a_checkpoint_saved_behind_damaged_ones_is_kept(state, tmp_path):
+    for steps in (64, 128, 192, 256):
+        saved(state, tmp_path, steps, keep=9)
+    for damaged in (192, 256):
+        (tmp_path / f"steps_{damaged:012d}.msgpack").write_bytes(b"")
+    saved(state, tmp_path, 160, keep=1)
+    assert [int(p.stem[6:]) for p in checkpoint.found(tmp_path)] == [160, 192, 256]
+
+
 def test_a_renamed_checkpoint_is_refused(state, tmp_path):
     path = saved(state, tmp_path, 64).rename(tmp_path / "steps_000000000128.msgpack")
     with pytest.raises(CheckpointError, match="is renamed, it was saved after 1 iterations"):
@@ -121,16 +132,16 @@ def test_a_directory_without_checkpoints_is_refused(tmp_path):
         checkpoint.newest(tmp_path, SMALL)
 
 
-def test_a_damaged_checkpoint_gives_way_to_an_older_one_and_links_are_not_followed(state, tmp_path):
+def test_a_damaged_checkpoint_gives_way_to_an_older_one_and_links_are_not_followed(state, tmp_path, capsys):
     directory = tmp_path / "checkpoints"
     directory.mkdir()
     whole, broken = (saved(state, directory, steps) for steps in (64, 128))
     broken.write_bytes(broken.read_bytes()[:-1])
     (directory / "steps_000000000192.msgpack").symlink_to(whole)
-    _, path, wrong = checkpoint.newest(tmp_path, SMALL)
+    _, path = checkpoint.newest(tmp_path, SMALL)
     assert path == whole
-    assert len(wrong) == 1
-    assert "its checksum differs" in wrong[0]
+    warning = f"warning: {broken}: is damaged (its checksum differs); falling back to {whole.name}\n"
+    assert capsys.readouterr().err == warning
     whole.unlink()
     with pytest.raises(CheckpointError, match="its checksum differs"):
         checkpoint.newest(tmp_path, SMALL)
@@ -163,6 +174,13 @@ def test_metrics_continue_behind_the_checkpoint_whatever_followed_it(tmp_path):
     np.testing.assert_array_equal(returns[:, 0], [0, 1, 2, 3, 4, 0, 1])
     with pytest.raises(ConfigError, match="must hold the 9 iterations"):
         metrics.MetricsFile(path, config, 9)
+    for seconds in ("NaN", "Infinity", "-1", '"inf"', "null"):
+        path.write_text(path.read_text().replace('"seconds": 2.0', f'"seconds": {seconds}'))
+        before = path.read_bytes()
+        with pytest.raises(ConfigError, match="must hold the 7 iterations"):
+            metrics.MetricsFile(path, config, 7)
+        assert path.read_bytes() == before
+        path.write_text(path.read_text().replace(f'"seconds": {seconds}', '"seconds": 2.0'))
 
 
 EVALUATIONS = [
@@ -255,7 +273,7 @@ def test_an_incident_can_be_replayed_from_its_file(state, tmp_path):
 
 
 def test_a_run_directory_says_what_the_run_is(tmp_path):
-    run_directory.create(tmp_path / "a" / "b", SMALL)
+    run_directory.create(tmp_path / "a" / "b", SMALL, RunOptions())
     assert run_directory.read_config(tmp_path / "a" / "b") == SMALL
     manifest = json.loads((tmp_path / "a" / "b" / "manifest.json").read_text())
     assert manifest["versions"]["jax"] == jax.__version__
@@ -265,16 +283,16 @@ def test_a_run_directory_says_what_the_run_is(tmp_path):
 def test_a_used_or_unwritable_run_directory_is_refused_and_left_alone(tmp_path):
     (tmp_path / "note.txt").write_text("mine")
     with pytest.raises(ConfigError, match=r"--run-dir .*: must be a new or empty directory"):
-        run_directory.create(tmp_path, SMALL)
+        run_directory.create(tmp_path, SMALL, RunOptions())
     assert [p.name for p in tmp_path.iterdir()] == ["note.txt"]
     with pytest.raises(ConfigError, match=r"--run-dir .*: must be a directory that can be written"):
-        run_directory.create(tmp_path / "note.txt" / "below", SMALL)
+        run_directory.create(tmp_path / "note.txt" / "below", SMALL, RunOptions())
     with pytest.raises(ConfigError, match=r"--run-dir .*: must be a new or empty directory"):
-        run_directory.create(tmp_path / "note.txt", SMALL)
+        run_directory.create(tmp_path / "note.txt", SMALL, RunOptions())
 
 
 def test_an_empty_run_directory_is_welcome(tmp_path):
-    run_directory.create(tmp_path, SMALL)
+    run_directory.create(tmp_path, SMALL, RunOptions())
     assert (tmp_path / "checkpoints").is_dir()
 
 

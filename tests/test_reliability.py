@@ -20,7 +20,7 @@ import pytest
 
 import dgae_jax as dg
 from dgae_jax.config import ConfigError
-from dgae_jax.io import checkpoint, files, metrics, run_directory, training
+from dgae_jax.io import checkpoint, files, manifest, metrics, run_directory, training
 from dgae_jax.io import record as record_module
 from dgae_jax.io.evaluation import evaluate_run
 from dgae_jax.io.options import RunOptions
@@ -146,11 +146,20 @@ def test_a_directory_in_use_is_refused_and_left_alone_also_while_its_configurati
         pass
 
 
-@pytest.mark.parametrize(("path", "value"), [(("cores",), 99), (("device",), "tpu: v9"), (("versions", "jaxlib"), "0.0.1")])
+@pytest.mark.parametrize(
+    ("path", "value"),
+    [
+        (("cores",), 99),
+        (("device",), "tpu: v9"),
+        (("git_revision",), "abc"),
+        (("versions", "jaxlib"), "0.0.1"),
+        (("settings", "jax_enable_x64"), True),
+    ],
+)
 def test_another_machine_or_version_is_refused_by_both_values_unless_asked_for_and_then_warned_of(path, value, run_dir, capsys):
-    manifest = json.loads((run_dir / "manifest.json").read_text())
-    (manifest if len(path) == 1 else manifest[path[0]])[path[-1]] = value
-    files.write_json(run_dir / "manifest.json", manifest)
+    written = json.loads((run_dir / "manifest.json").read_text())
+    (written if len(path) == 1 else written[path[0]])[path[-1]] = value
+    files.write_json(run_dir / "manifest.json", written)
     with pytest.raises(ConfigError, match=rf"must go on where it began, or with --inexact; now {path[-1]} .* \(was {value}\)"):
         resume(small("ppo"), dataclasses.replace(QUIET, resume=run_dir))
     assert resume(small("ppo"), dataclasses.replace(QUIET, resume=run_dir, inexact=True)) == 0
@@ -278,20 +287,46 @@ def test_a_directory_that_cannot_be_written_is_one_clear_line(run_dir):
         resume(small("ppo"), dataclasses.replace(QUIET, resume=run_dir))
 
 
-@pytest.mark.parametrize("name", ["config.json", "metrics.jsonl", "evaluations.jsonl", "checkpoints"])
-def test_a_run_directory_with_a_link_where_it_would_write_is_refused_and_nothing_is_touched(name, run_dir, tmp_path):
+PARTS = ["config.json", "metrics.jsonl", "evaluations.jsonl", "checkpoints", "checkpoints/steps_000000000256.msgpack"]
+
+
+@pytest.mark.parametrize("name", PARTS)
+def test_a_run_directory_with_a_link_in_it_is_refused_and_nothing_is_touched(name, run_dir, tmp_path):
     (run_dir / name).rename(tmp_path / "outside")
     (run_dir / name).symlink_to(tmp_path / "outside")
     before = sorted((p, p.lstat().st_mtime_ns) for p in tmp_path.rglob("*"))
-    with pytest.raises(ConfigError, match=rf"run/{name}: must be in the run directory itself, not a link or a device"):
+    with pytest.raises(ConfigError, match=rf"run/{name}: must be a (file|directory) in the run directory itself, not a link"):
         resume(run_directory.read_config(run_dir), dataclasses.replace(QUIET, resume=run_dir))
     assert sorted((p, p.lstat().st_mtime_ns) for p in tmp_path.rglob("*")) == before
+
+
+def test_a_run_that_lost_its_checkpoints_is_refused_and_keeps_the_rest(run_dir):
+    shutil.rmtree(run_dir / "checkpoints")
+    before = timeless(run_dir)
+    with pytest.raises(ConfigError, match=r"must hold a checkpoint; it had some when it was evaluated"):
+        resume(small("ppo"), dataclasses.replace(QUIET, resume=run_dir))
+    assert timeless(run_dir) == before
+
+
+def test_a_run_that_is_refused_for_its_metrics_is_left_as_it_was(run_dir):
+    rows = (run_dir / "metrics.jsonl").read_text().splitlines(keepends=True)
+    (run_dir / "metrics.jsonl").write_text("".join(rows[:3]))
+    before = {p: p.read_bytes() for p in run_dir.rglob("*") if p.is_file()}
+    with pytest.raises(ConfigError, match="must hold the 8 iterations"):
+        resume(dataclasses.replace(small("ppo"), total_steps=9999), dataclasses.replace(QUIET, resume=run_dir))
+    assert {p: p.read_bytes() for p in run_dir.rglob("*") if p.is_file()} == before
+
+
+def test_a_resumed_run_goes_on_with_its_options(run_dir):
+    assert manifest.options(run_dir) == RunOptions(checkpoint_every=256, episodes=1)
+    manifest.add(run_dir, RunOptions(keep_checkpoints=7, debug_nonfinite=True))
+    assert manifest.options(run_dir) == RunOptions(keep_checkpoints=7, debug_nonfinite=True)
 
 
 def test_a_pipe_in_place_of_a_file_is_refused_and_does_not_hang(run_dir):
     (run_dir / "config.json").unlink()
     os.mkfifo(run_dir / "config.json")
-    with pytest.raises(ConfigError, match="not a link or a device"):
+    with pytest.raises(ConfigError, match="not a link or anything else"):
         run_directory.read_config(run_dir)
 
 
@@ -312,7 +347,7 @@ def test_updates_that_are_not_finite_are_left_out_and_counted_and_end_the_run_wh
     assert "updates were not finite and were left out" in capsys.readouterr().err
     rows = metrics.read(tmp_path / "run" / "metrics.jsonl")
     assert sum(row["skipped"] for row in rows) >= 3
-    state, _, _ = checkpoint.newest(tmp_path / "run", run_directory.read_config(tmp_path / "run"))
+    state, _ = checkpoint.newest(tmp_path / "run", run_directory.read_config(tmp_path / "run"))
     assert all(jnp.isfinite(x).all() for fit in (state.policy, state.critic) for x in fit.params["params"]["Dense_0"].values())
     assert not (tmp_path / "run" / "evaluation.json").exists()
 
@@ -375,7 +410,7 @@ def test_a_signal_saves_within_half_a_minute_and_a_second_one_ends_at_once(kind,
         assert process.returncode in ((code,) if signals == 1 else (code, -kind))
         if signals == 1:
             assert f"continue with --resume {run_dir}" in out
-    state, _, _ = checkpoint.newest(run_dir, run_directory.read_config(run_dir))
+    state, _ = checkpoint.newest(run_dir, run_directory.read_config(run_dir))
     assert int(state.iteration[0]) >= 1
 
 

@@ -3,6 +3,7 @@
 import hashlib
 import json
 import re
+import sys
 from pathlib import Path
 
 import jax
@@ -35,13 +36,14 @@ def arrays_of(state: TrainState) -> dict[str, np.ndarray]:
 def save(directory: Path, config: Config, arrays: dict[str, np.ndarray], steps: int, keep: int = 3, best: int | None = None) -> Path:
     """Write `steps_….msgpack`, complete or not at all, and delete all but the newest `keep` and that of `best` steps.
 
-    The file is one line of JSON, with schema and checksum, and the configuration and the arrays in msgpack.
+    Files of more steps do not count: the run went back behind them because they were damaged. The file is one line of JSON, with
+    schema and checksum, and the configuration and the arrays in msgpack.
     """
     path = directory / _name_of(steps)
     body = serialization.msgpack_serialize({"config": json.dumps(to_dict(config)), "arrays": arrays})
     header = {"schema": SCHEMA, "sha256": hashlib.sha256(body).hexdigest()}
     files.replace(path, json.dumps(header).encode() + b"\n" + body)
-    for old in found(directory)[:-keep]:
+    for old in [p for p in found(directory) if p.name <= path.name][:-keep]:
         if best is None or old.name != _name_of(best):
             old.unlink(missing_ok=True)
     return path
@@ -57,17 +59,21 @@ def found(directory: Path) -> list[Path]:
     return sorted(p for p in named if p.is_file() and not p.is_symlink())
 
 
-def newest(run_dir: Path, config: Config) -> tuple[TrainState, Path, list[str]]:
-    """The state of the newest checkpoint that is whole, its file, and what was wrong with newer ones.
+def newest(run_dir: Path, config: Config) -> tuple[TrainState, Path]:
+    """The state of the newest checkpoint that is whole, and its file; warns of damaged ones.
 
     Raises CheckpointError if there is none.
     """
     wrong = []
     for path in reversed(found(run_dir / "checkpoints")):
         try:
-            return load(path, config), path, wrong
+            state = load(path, config)
         except DamagedError as reason:
             wrong.append(str(reason))
+            continue
+        for each in wrong:
+            print(f"warning: {each}; falling back to {path.name}", file=sys.stderr)
+        return state, path
     raise CheckpointError("; ".join(wrong) or f"{run_dir}: must hold a checkpoint; checkpoints/ has none")
 
 
@@ -113,9 +119,11 @@ def _read(path: Path) -> tuple[Config, dict[str, np.ndarray]]:
         raise DamagedError(f"{path}: cannot be read ({reason.strerror})") from reason
     try:
         header = json.loads(first)
-        schema, checksum = int(header["schema"]), str(header["sha256"])
+        schema, checksum = header["schema"], header["sha256"]
     except (ValueError, TypeError, KeyError, RecursionError):
         raise DamagedError(f"{path}: is damaged (no header)") from None
+    if type(schema) is not int:
+        raise DamagedError(f"{path}: is damaged (no schema)")
     if schema != SCHEMA:
         raise CheckpointError(f"{path}: has schema {schema}; this version reads schema {SCHEMA}")
     if hashlib.sha256(body).hexdigest() != checksum:

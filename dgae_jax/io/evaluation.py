@@ -43,7 +43,7 @@ def evaluate_run(run_dir: Path, config: Config, *, which: str, engine: str, epis
     Raises ConfigError if the best is asked for and nothing was evaluated.
     """
     if which == "newest":
-        state, path, _ = checkpoint.newest(run_dir, config)
+        state, path = checkpoint.newest(run_dir, config)
     else:
         steps = EvaluationsFile(run_dir / "evaluations.jsonl").best
         if steps is None:

@@ -14,32 +14,48 @@ from typing import Any
 import jax
 
 from dgae_jax.io import files
+from dgae_jax.io.options import RunOptions, from_dict, to_dict
 
 _VERSIONS_OF = ("dgae_jax", "jax", "jaxlib", "flax", "optax", "brax", "mujoco", "mujoco-mjx", "gymnasium", "numpy")
 
+_SETTINGS = ("jax_enable_x64", "jax_default_prng_impl", "jax_threefry_partitionable", "jax_default_matmul_precision")
+"""Of JAX, which the environment may change and on which the bits depend."""
 
-def write(run_dir: Path) -> None:
+
+def write(run_dir: Path, options: RunOptions) -> None:
     """The first part of a run."""
-    files.write_json(run_dir / "manifest.json", {**_now(), "resumed": []})
+    files.write_json(run_dir / "manifest.json", {**_now(), "options": to_dict(options), "resumed": []})
 
 
-def add(run_dir: Path) -> None:
+def add(run_dir: Path, options: RunOptions) -> None:
     """A part that continues it."""
     before = _read(run_dir)
-    files.write_json(run_dir / "manifest.json", {**before, "resumed": [*_resumed(before), _now()]})
+    parts = [*_resumed(before), {**_now(), "options": to_dict(options)}]
+    files.write_json(run_dir / "manifest.json", {**before, "resumed": parts})
+
+
+def options(run_dir: Path) -> RunOptions:
+    """The options of the last part of the run, as far as they can be read."""
+    return from_dict(_last(run_dir).get("options"))
 
 
 def changes(run_dir: Path) -> list[str]:
     """What decides the bits of a result and is not what it was in the last part of the run."""
-    before = _read(run_dir)
-    was, now = _deciding((_resumed(before) or [before])[-1]), _deciding(_now())
+    was, now = _deciding(_last(run_dir)), _deciding(_now())
     return [f"{name} {value} (was {was.get(name)})" for name, value in now.items() if was.get(name) != value]
 
 
-def _deciding(part: Any) -> dict[str, Any]:
-    part = part if isinstance(part, dict) else {}
-    versions = part.get("versions")
-    return {name: part.get(name) for name in ("device", "devices", "cores")} | (versions if isinstance(versions, dict) else {})
+def _deciding(part: dict[str, Any]) -> dict[str, Any]:
+    found = {name: part.get(name) for name in ("device", "devices", "cores", "git_revision")}
+    for table in (part.get("settings"), part.get("versions")):
+        found |= table if isinstance(table, dict) else {}
+    return found
+
+
+def _last(run_dir: Path) -> dict[str, Any]:
+    before = _read(run_dir)
+    part = (_resumed(before) or [before])[-1]
+    return part if isinstance(part, dict) else {}
 
 
 def _read(run_dir: Path) -> dict[str, Any]:
@@ -66,6 +82,7 @@ def _now() -> dict[str, Any]:
         "device": f"{jax.default_backend()}: {_model()}",
         "devices": jax.device_count(),
         "cores": _cores(),
+        "settings": {name: getattr(jax.config, name, None) for name in _SETTINGS} | {"XLA_FLAGS": os.environ.get("XLA_FLAGS")},
         "versions": {name: _version(name) for name in _VERSIONS_OF},
     }
 

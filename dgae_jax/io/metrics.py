@@ -31,7 +31,7 @@ class MetricsFile:
         with contextlib.suppress(FileNotFoundError, LookupError, TypeError, ValueError, OverflowError):
             for row, behind in itertools.islice(files.whole_rows(path), done * self.seeds):
                 iteration, seed = divmod(len(self.returns), self.seeds)
-                if (row["iteration"], row["seed"]) != (iteration + 1, config.seed + seed):
+                if (row["iteration"], row["seed"]) != (iteration + 1, config.seed + seed) or not 0 <= row["seconds"] < math.inf:
                     break
                 self._take(row)
                 end = behind

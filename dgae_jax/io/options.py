@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from dgae_jax.config import ConfigError, flag
 
@@ -19,7 +20,7 @@ class RunOptions:
     keep_checkpoints: int = 3
     """The newest checkpoints that are kept, beside the one with the best evaluation [files]."""
     resume: Path | None = None
-    """Continue the run in this directory, bit for bit; other flags may be left out [path]."""
+    """Continue the run in this directory, bit for bit, with its flags where none are given [path]."""
     inexact: bool = False
     """Let --resume continue with another --physics, device, number of cores or versions: the same in the statistical sense only."""
     max_nonfinite: int = 10
@@ -40,3 +41,19 @@ def validate_options(options: RunOptions) -> None:
         raise ConfigError(f"--run-dir {options.run_dir}: must be left out: --resume writes to {options.resume}")
     if options.resume is None and options.inexact:
         raise ConfigError("--inexact True: must be left out without --resume")
+
+
+_KEPT = ("checkpoint_every", "keep_checkpoints", "max_nonfinite", "episodes", "debug_nonfinite")
+"""What a run goes on with when it is resumed."""
+
+
+def to_dict(options: RunOptions) -> dict[str, Any]:
+    """What a run goes on with, for JSON."""
+    return {name: getattr(options, name) for name in _KEPT}
+
+
+def from_dict(data: Any) -> RunOptions:
+    """What `to_dict` wrote; defaults for all else."""
+    found = data if isinstance(data, dict) else {}
+    usual = to_dict(RunOptions())
+    return RunOptions(**{name: found[name] for name in _KEPT if type(found.get(name)) is type(usual[name])})

@@ -9,11 +9,12 @@ import json
 import stat
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 from dgae_jax.config import Config, ConfigError, from_dict, to_dict
 from dgae_jax.io import files, manifest
+from dgae_jax.io.options import RunOptions
 from dgae_jax.validation import validate
 
 
@@ -22,7 +23,7 @@ def default_path(config: Config) -> Path:
     return Path("runs") / f"{config.env}-{config.algo}-{config.seed}-{time.strftime('%Y%m%d-%H%M%S')}"
 
 
-def create(path: Path, config: Config) -> None:
+def create(path: Path, config: Config, options: RunOptions) -> None:
     """Make a new run directory and write what the run is.
 
     Raises ConfigError, and writes nothing, if the directory holds anything already or cannot be written.
@@ -32,7 +33,7 @@ def create(path: Path, config: Config) -> None:
             raise ConfigError(f"--run-dir {path}: must be a new or empty directory")
         (path / "checkpoints").mkdir(parents=True)
         write_config(path, config)
-        manifest.write(path)
+        manifest.write(path, options)
     except OSError as reason:
         raise ConfigError(f"--run-dir {path}: must be a directory that can be written ({reason.strerror})") from reason
 
@@ -60,12 +61,19 @@ def _lock(file) -> None:
 
 def read_config(path: Path) -> Config:
     """The configuration of a run; raises ConfigError if `path` is not a run directory, or one with links or devices in it."""
-    for name in ("config.json", "manifest.json", "metrics.jsonl", "evaluations.jsonl", "checkpoints", "nonfinite"):
-        with contextlib.suppress(OSError):  # what is missing is missed by those who need it
-            mode = (path / name).lstat().st_mode
-            if not (stat.S_ISREG(mode) or stat.S_ISDIR(mode)):
-                raise ConfigError(f"{path / name}: must be in the run directory itself, not a link or a device")
+    for name in ("checkpoints", "nonfinite"):
+        _check_own(path / name, "directory", stat.S_ISDIR)
+    for name in ("config.json", "manifest.json", "metrics.jsonl", "evaluations.jsonl"):
+        _check_own(path / name, "file", stat.S_ISREG)
+    for file in path.glob("checkpoints/steps_*.msgpack"):
+        _check_own(file, "file", stat.S_ISREG)
     return read_config_file(path / "config.json")
+
+
+def _check_own(part: Path, kind: str, is_kind: Callable[[int], bool]) -> None:
+    with contextlib.suppress(OSError):  # what is missing is missed by those who need it
+        if not is_kind(part.lstat().st_mode):
+            raise ConfigError(f"{part}: must be a {kind} in the run directory itself, not a link or anything else")
 
 
 def read_config_file(path: Path) -> Config:

@@ -1,6 +1,7 @@
 """Stopping on request."""
 
 import contextlib
+import os
 import signal
 from collections.abc import Iterator
 from typing import Any
@@ -55,3 +56,5 @@ class Signals:
         for each in self.before:
             signal.signal(each, signal.SIG_DFL)
         self._stop()
+        # no print: it may be what was interrupted
+        os.write(2, f"{self.name}: finishing what is running, then saving; a second signal ends it at once\n".encode())

@@ -11,6 +11,7 @@ import numpy as np
 from dgae_jax.build import make_task, make_trainer, seed_keys
 from dgae_jax.config import Config, ConfigError, differences, flag, resolve
 from dgae_jax.io import checkpoint, files, machine, manifest, run_directory
+from dgae_jax.io.evaluation import EvaluationsFile
 from dgae_jax.io.options import RunOptions, validate_options
 from dgae_jax.io.progress import Reporter
 from dgae_jax.io.record import Record
@@ -32,7 +33,7 @@ def train(config: Config, options: RunOptions) -> int:
     """
     config = _prepared(config, options)
     run_dir = options.run_dir or run_directory.default_path(config)
-    run_directory.create(run_dir, config)
+    run_directory.create(run_dir, config, options)
     with run_directory.locked(run_dir):
         return _run(config, options, run_dir, None)
 
@@ -83,11 +84,11 @@ def _warn_of_another_sample(reason: str) -> None:
 def _last_state(run_dir: Path, config: Config) -> TrainState | None:
     """From the newest whole checkpoint; None if the run stopped before its first."""
     if not checkpoint.found(run_dir / "checkpoints"):
+        if EvaluationsFile(run_dir / "evaluations.jsonl").rows:
+            raise ConfigError(f"{run_dir}: must hold a checkpoint; it had some when it was evaluated, checkpoints/ has none")
         print(f"{run_dir} has no checkpoint yet: it starts again")
         return None
-    state, path, wrong = checkpoint.newest(run_dir, config)
-    for reason in wrong:
-        print(f"warning: {reason}; falling back", file=sys.stderr)
+    state, path = checkpoint.newest(run_dir, config)
     done = config.samples * int(state.iteration[0])
     if config.total_steps < done:
         raise ConfigError(f"--total-steps {config.total_steps}: must be at least the {done} that are done in {run_dir}")
@@ -100,10 +101,10 @@ def _run(config: Config, options: RunOptions, run_dir: Path, state: TrainState |
     done = 0 if state is None else int(state.iteration[0])
     with Signals() as signals:
         try:
-            if options.resume:
-                run_directory.write_config(run_dir, config)
-                manifest.add(run_dir)
             with Record(run_dir, config, options, done) as record:
+                if options.resume:
+                    run_directory.write_config(run_dir, config)
+                    manifest.add(run_dir, options)
                 state = _iterate(config, options, record, signals, state)
                 if _broken(state, options):
                     return _broke_down(state, run_dir)
