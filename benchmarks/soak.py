@@ -52,6 +52,9 @@ def main() -> int:
     since = time.monotonic()
     process.send_signal(signal.SIGTERM)
     code, stopping = process.wait(), time.monotonic() - since
+    if len(rows) < 4:
+        print(f"error: the run ended, with exit code {code}, before there were four measurements", file=sys.stderr)
+        return 1
     steps = metrics.read(arguments.run_dir / "metrics.jsonl")[-1]["steps"]
     print(f"{steps:,} samples in {arguments.minutes:g} minutes, then SIGTERM: exit code {code} after {stopping:.1f} s")
     grown = False

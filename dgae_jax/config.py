@@ -174,6 +174,10 @@ def resolve(config: Config) -> Config:
     )
 
 
+MAY_CHANGE = ("total_steps", "physics")
+"""What of a configuration may change between the parts of one run."""
+
+
 def flag(path: str) -> str:
     """The command-line spelling of a field."""
     return "--" + path.replace("_", "-")

@@ -12,7 +12,7 @@ import numpy as np
 from flax import serialization
 
 from dgae_jax.build import make_task, make_trainer, seed_keys
-from dgae_jax.config import Config, ConfigError, differences, from_dict, to_dict
+from dgae_jax.config import MAY_CHANGE, Config, ConfigError, differences, from_dict, to_dict
 from dgae_jax.io import files
 from dgae_jax.types import TrainState
 
@@ -90,7 +90,7 @@ def load(path: Path, config: Config) -> TrainState:
     """
     saved, got = _read(path)
     for name, (ours, theirs) in differences(config, saved).items():
-        if name not in ("total_steps", "physics"):
+        if name not in MAY_CHANGE:
             raise CheckpointError(f"{path}: is of another run, its {name} is {theirs}, here {ours}")
     blank = jax.eval_shape(make_trainer(make_task(config), 1).init, config, seed_keys(config))
     want = jax.eval_shape(_plain, blank)

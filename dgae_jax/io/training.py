@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from dgae_jax.build import make_task, make_trainer, seed_keys
-from dgae_jax.config import Config, ConfigError, differences, flag, resolve
+from dgae_jax.config import MAY_CHANGE, Config, ConfigError, differences, flag, resolve
 from dgae_jax.io import checkpoint, files, machine, manifest, run_directory
 from dgae_jax.io.evaluation import EvaluationsFile
 from dgae_jax.io.options import RunOptions, validate_options
@@ -65,7 +65,7 @@ def _compare(config: Config, saved: Config, run_dir: Path, inexact: bool) -> Non
     """Refuse what would not continue the run `saved`, but for what `inexact` allows."""
     changed = differences(config, saved)
     for path, (ours, theirs) in changed.items():
-        if path not in ("total_steps", "physics") or (path == "physics" and not inexact):
+        if path not in MAY_CHANGE or (path == "physics" and not inexact):
             raise ConfigError(f"{flag(path)} {ours}: must be {theirs} as in {run_dir}, or left out")
     elsewhere = "; ".join(manifest.changes(run_dir))
     if elsewhere and not inexact:
