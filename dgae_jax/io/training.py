@@ -74,7 +74,7 @@ def _compare(config: Config, saved: Config, run_dir: Path, inexact: bool) -> Non
         ours, theirs = changed["physics"]
         _warn_of_another_sample(f"physics {ours} (was {theirs}): one step differs by up to 1e-4")
     if elsewhere:
-        _warn_of_another_sample(f"{elsewhere}: rounding differs, by up to 1e-6 relative per operation")
+        _warn_of_another_sample(f"{elsewhere}: rounding differs, by up to 1e-6 relative per operation, if nothing else does")
 
 
 def _warn_of_another_sample(reason: str) -> None:
