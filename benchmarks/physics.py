@@ -24,11 +24,12 @@ from mujoco import mjx as mujoco_mjx
 from mujoco.batch import Batch
 
 import dgae_jax as dg
-from dgae_jax.build import make_greedy, make_task
+from dgae_jax.cli.arguments import parse
+from dgae_jax.configs.build import make_greedy, make_task
 from dgae_jax.envs.registry import TASKS
 from dgae_jax.envs.task import load_spec
-from dgae_jax.io import checkpoint, cli, run_directory
-from dgae_jax.physics.mjx import mjx
+from dgae_jax.physics.jax.engine import jax_engine
+from dgae_jax.run import checkpoint, directory
 
 
 @dataclass(frozen=True)
@@ -101,7 +102,7 @@ def jax_speed(step: Callable, state: Any, controls: int, worlds: int, steps: int
 def ours(name: str, worlds: int, steps: int) -> tuple[float, float]:
     """Our step."""
     task = TASKS[name]
-    physics = mjx(load_spec(task.FILE["v4"]), task.FRAME_SKIP, max_contacts=task.CONTACTS)
+    physics = jax_engine(load_spec(task.FILE["v4"]), task.FRAME_SKIP, max_contacts=task.CONTACTS)
     start = physics.at_pose(jnp.asarray(physics.model.qpos0), jnp.zeros(physics.model.nv))
     return jax_speed(physics.step, start, physics.model.nu, worlds, steps)
 
@@ -154,7 +155,7 @@ def visited(name: str, count: int, act: Callable[[np.ndarray], np.ndarray] | Non
 
 def errors(name: str, poses: tuple[np.ndarray, ...]) -> str:
     """Observation and reward errors of one step of our `mjx` from each pose."""
-    env, gym = dg.make_env(name, physics="mjx"), gymnasium_task(name)
+    env, gym = dg.make_env(name, physics="jax"), gymnasium_task(name)
 
     @jax.jit
     def step(key, qpos, qvel, action):
@@ -175,7 +176,7 @@ def errors(name: str, poses: tuple[np.ndarray, ...]) -> str:
 
 def policy_of(run_dir: Path) -> tuple[str, Callable[[np.ndarray], np.ndarray]]:
     """The task of a run and its mean action."""
-    config = dataclasses.replace(run_directory.read_config(run_dir), physics="native")
+    config = dataclasses.replace(directory.read_config(run_dir), physics="native")
     with jax.enable_x64(False):  # policies are float32
         state = jax.tree.map(lambda x: x[0], checkpoint.newest(run_dir, config)[0])
         greedy = jax.jit(make_greedy(make_task(config), config))
@@ -189,7 +190,7 @@ def policy_of(run_dir: Path) -> tuple[str, Callable[[np.ndarray], np.ndarray]]:
 
 def main() -> None:
     """Print both tables."""
-    arguments = cli.parse(Arguments, "Speed and exactness of the physics.")
+    arguments = parse(Arguments, "Speed and exactness of the physics.")
     jax.config.update("jax_enable_compilation_cache", False)
     jax.config.update("jax_platforms", {"cpu": "cpu", "gpu": "cuda"}[arguments.device])
     jax.config.update("jax_enable_x64", arguments.x64)

@@ -14,7 +14,8 @@ import time
 from dataclasses import dataclass
 from pathlib import Path
 
-from dgae_jax.io import cli, files, metrics
+from dgae_jax.cli.arguments import parse
+from dgae_jax.run import files, metrics
 
 TRAIN = Path(__file__).parent.parent / "experiments" / "train.py"
 
@@ -39,7 +40,7 @@ def measured(pid: int) -> dict[str, float]:
 
 
 def main() -> int:
-    arguments = cli.parse(Arguments, "Watch the memory of a long run.")
+    arguments = parse(Arguments, "Watch the memory of a long run.")
     argv = ["--run-dir", str(arguments.run_dir), "--physics", "native", "--total-steps", "1_000_000_000"]
     process = subprocess.Popen([sys.executable, str(TRAIN), *argv], stdout=subprocess.DEVNULL)
     began, rows = time.monotonic(), []

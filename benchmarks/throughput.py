@@ -18,8 +18,8 @@ import gymnasium
 import jax
 
 from dgae_jax import Config
-from dgae_jax.build import make_task, make_trainer, seed_keys
-from dgae_jax.io import cli
+from dgae_jax.cli.arguments import parse
+from dgae_jax.configs.build import make_task, make_trainer, seed_keys
 
 
 @dataclass(frozen=True)
@@ -28,7 +28,7 @@ class Arguments:
 
     seconds: float = 20.0
     """Time to measure each setting, after compilation [s]."""
-    physics: tuple[str, ...] = ("native", "mjx")
+    physics: tuple[str, ...] = ("native", "jax")
     """Engines of ours to measure."""
     peer: bool = True
     """Measure stable-baselines3 too."""
@@ -108,7 +108,7 @@ def settings(arguments: Arguments) -> Iterator[Callable[[], Row]]:
 
 def main() -> None:
     """Print a row per setting, then our speed over the peer's fastest."""
-    arguments = cli.parse(Arguments, "Training throughput on Hopper.")
+    arguments = parse(Arguments, "Training throughput on Hopper.")
     jax.config.update("jax_enable_compilation_cache", False)
     print(f"{os.cpu_count()} cores, {jax.devices()[0].device_kind}, jax {jax.__version__}")
     print(f"{'setting':66s} {'compile s':>9s} {'steps/s':>9s}")

@@ -6,12 +6,11 @@ import io
 with contextlib.redirect_stdout(io.StringIO()):  # mujoco.mjx prints that it has no Warp, which is no news here
     import mujoco.mjx  # noqa: F401
 
-from dgae_jax.build import make_algorithm, make_train
-from dgae_jax.config import Config, ConfigError, CriticConfig, NoiseConfig, PolicyConfig
-from dgae_jax.distortion import METRICS, weights_of
+from dgae_jax.configs.build import make_algorithm, make_train
+from dgae_jax.configs.config import Config, ConfigError, CriticConfig, NoiseConfig, PolicyConfig
+from dgae_jax.configs.presets import preset
 from dgae_jax.envs.registry import make_env
-from dgae_jax.presets import preset
-from dgae_jax.returns import (
+from dgae_jax.maths.returns import (
     bellman_target,
     dgae,
     distributional_td_residual,
@@ -23,8 +22,9 @@ from dgae_jax.returns import (
     sr_lambda_target,
     td_residual,
 )
-from dgae_jax.statistics import bootstrap_interval, coverage, crps, explained_variance, iqm, pit
-from dgae_jax.transport import directional_metric, quantile_huber_loss, quantile_midpoints, wasserstein
+from dgae_jax.maths.risk import METRICS, weights_of
+from dgae_jax.maths.statistics import bootstrap_interval, coverage, crps, explained_variance, iqm, pit
+from dgae_jax.maths.transport import directional_metric, quantile_huber_loss, quantile_midpoints, wasserstein
 
 __version__ = "0.1.0"
 

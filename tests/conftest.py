@@ -5,10 +5,7 @@ import tempfile
 
 import jaxtyping
 
-ARRAYS = """
-    transport returns gaussian statistics distortion networks physics critics updates normalizers diagnostics envs rollout train
-"""
-jaxtyping.install_import_hook([f"dgae_jax.{module}" for module in ARRAYS.split()], "beartype.beartype")
+jaxtyping.install_import_hook([f"dgae_jax.{room}" for room in ("maths", "physics", "envs", "learn")], "beartype.beartype")
 
 import jax  # noqa: E402
 import pytest  # noqa: E402

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from dgae_jax.envs.task import HealthyTask, Task
-from dgae_jax.physics.base import Physics, PhysicsState
+from dgae_jax.physics.engine import Physics, PhysicsState
 
 Range = tuple[float, float]
 

@@ -10,11 +10,11 @@ from jaxtyping import Array, Float
 
 from dgae_jax.envs.gym_tasks import Ant, Hopper, Swimmer, Walker2d
 from dgae_jax.envs.task import Task, load_spec
-from dgae_jax.physics.mjx import mjx
+from dgae_jax.physics.jax.engine import jax_engine
 from dgae_jax.physics.native import native
 
 TASKS: dict[str, type[Task]] = {"ant": Ant, "hopper": Hopper, "swimmer": Swimmer, "walker2d": Walker2d}
-PHYSICS = {"mjx": mjx, "native": native}
+PHYSICS = {"jax": jax_engine, "native": native}
 VERSIONS = ("v4", "v5")
 
 BRAX = "brax:"
@@ -30,7 +30,7 @@ class BraxTask(Wrapper):
         return -jnp.ones(self.action_size), jnp.ones(self.action_size)
 
 
-def make_env(name: str, *, physics: str = "mjx", version: str = "v4", **task_parameters) -> Env:
+def make_env(name: str, *, physics: str = "jax", version: str = "v4", **task_parameters) -> Env:
     """The task `name` over the physics `physics`, with Gymnasium's semantics of `version` (v4 is Gym's v3).
 
     `task_parameters` are those of Gymnasium's constructor. `brax:NAME` is an environment of Brax's own, on `mjx`; its
@@ -62,5 +62,5 @@ def _make_brax(name: str, physics: str, **parameters) -> Env:
         raise ValueError(f"unknown environment {BRAX}{name}; brax.envs knows no {name!r}") from None
 
 
-for _name in TASKS:  # for Brax's own trainers: brax.envs.get_environment("dgae_hopper", physics="mjx")
+for _name in TASKS:  # for Brax's own trainers: brax.envs.get_environment("dgae_hopper", physics="jax")
     brax.envs.register_environment(f"dgae_{_name}", partial(make_env, _name))  # pyright: ignore[reportArgumentType]

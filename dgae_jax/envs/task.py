@@ -15,7 +15,7 @@ import mujoco
 from brax.envs.base import Env, State
 from jaxtyping import Array, ArrayLike, Bool, Float
 
-from dgae_jax.physics.base import Physics, PhysicsState
+from dgae_jax.physics.engine import Physics, PhysicsState
 
 
 def load_spec(filename: str) -> mujoco.MjSpec:

@@ -1,1 +1,1 @@
-"""Physics engines behind one contract: see `base`."""
+"""Physics engines behind one contract: see `engine`."""

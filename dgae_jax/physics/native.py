@@ -11,7 +11,7 @@ import mujoco
 import numpy as np
 from mujoco.batch import Batch
 
-from dgae_jax.physics.base import Physics, PhysicsState, has_free_root
+from dgae_jax.physics.engine import Physics, PhysicsState, has_free_root
 
 _FIELDS = ("qpos", "qvel", "qacc_warmstart")
 

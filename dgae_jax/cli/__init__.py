@@ -1,0 +1,1 @@
+"""The command lines: `dgae COMMAND …` and `python experiments/COMMAND.py …`."""

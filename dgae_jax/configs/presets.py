@@ -1,0 +1,69 @@
+"""Settings that belong together: `tuned` (ours) and `paper` (its set-up; docs/reproduction.md lists what it leaves open)."""
+
+import dataclasses
+from typing import Any
+
+from dgae_jax.configs.algorithms import TABLE
+from dgae_jax.configs.config import Config, ConfigError
+from dgae_jax.learn.updates import UPDATES
+
+Settings = dict[str, Any]
+"""Fields of `Config`, nested dictionaries for its parts."""
+
+
+def _tuned(update: str, critic: str, env: str) -> list[Settings]:
+    """One setting per way to update; a task departs from it only where it must."""
+    once = {"optimizer": "rmsprop", "learning_rate": 7e-4, "epochs": 1, "minibatches": 1}
+    by_update: dict[str, Settings] = {
+        "gradient": {"horizon": 8, "policy": once, "critic": once},
+        "trust-region": {"policy": {"radius": 0.02}, "critic": {"learning_rate": 1e-3}},
+    }
+    far: Settings = {"gamma": 0.9999} if env == "swimmer" else {}  # a stroke pays late: at 0.99 it stays still
+    return [by_update.get(update, {}), far]
+
+
+def _paper(update: str, critic: str, env: str) -> list[Settings]:
+    ant = env == "ant"
+    hidden, constant = (512, 512) if ant else (256, 256), {"learning_rate_end": 1.0}
+    networks: Settings = {
+        "total_steps": 10_000_000 if env in ("ant", "hopper") else 5_000_000,
+        "policy": {"hidden": hidden, "covariance": "state", "initial_std": 1.0},
+        "critic": {"hidden": hidden, "quantiles": 64, "target": "bellman" if critic == "quantile" else "lambda-return", **constant},
+    }
+    once = {"optimizer": "rmsprop", "learning_rate": 7e-4, "epochs": 1, "minibatches": 1, **constant}
+    by_update: dict[str, Settings] = {
+        "clip": {
+            "horizon": 256 if ant else 128,
+            "policy": {"minibatches": 64 if ant else 32, **constant},
+            "critic": {"minibatches": 64 if ant else 32},
+        },
+        "trust-region": {
+            "num_envs": 50 if ant else 25,
+            "horizon": 1000,
+            "critic": {"learning_rate": 1e-3, "minibatches": 500 if ant else 250},
+        },
+        "gradient": {"horizon": 5, "policy": once, "critic": once},
+    }
+    return [networks, by_update.get(update, {})]
+
+
+PRESETS = {"tuned": _tuned, "paper": _paper}
+
+
+def preset(name: str, algo: str, env: str, update: str = "default") -> Config:
+    """The configuration of a preset for an algorithm on a task; `update` takes the place of the algorithm's own.
+
+    Raises ConfigError for a name that does not exist.
+    """
+    for flag, value, table in (("preset", name, PRESETS), ("algo", algo, TABLE), ("policy.update", update, ("default", *UPDATES))):
+        if value not in table:
+            raise ConfigError(f"--{flag} {value}: must be one of {', '.join(table)}")
+    row, config = TABLE[algo], Config(env=env, algo=algo)
+    for settings in PRESETS[name](row.update if update == "default" else update, row.critic, env):
+        config = _with(config, settings)
+    return config
+
+
+def _with(config: Any, settings: Settings) -> Any:
+    parts = {k: _with(getattr(config, k), v) if isinstance(v, dict) else v for k, v in settings.items()}
+    return dataclasses.replace(config, **parts)

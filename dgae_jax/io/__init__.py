@@ -1,1 +1,0 @@
-"""Where the library meets the machine: files, clock, terminal, Gymnasium."""

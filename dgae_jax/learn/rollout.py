@@ -1,0 +1,129 @@
+"""Episodes in parallel worlds: time limits, true successors, fresh resets; for training and for evaluation."""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from brax.envs.base import Env
+from jaxtyping import Array, Bool, Float, Int, Key
+
+from dgae_jax.learn.types import Transition
+
+Act = Callable[[Array, Array], tuple[Array, Array]]
+"""`act(key, obs [N, O]) -> (action [N, A], log_prob [N])`."""
+
+
+class Episodes(NamedTuple):
+    """The worlds, and the episode each of them is in."""
+
+    env: Any
+    steps: Int[Array, " N"]
+    total: Float[Array, " N"]
+    """Undiscounted return so far."""
+    last_total: Float[Array, " N"]
+    """Undiscounted return of the last episode that ended in this world; NaN before the first."""
+    last_steps: Float[Array, " N"]
+    """Its length; NaN before the first."""
+    nonfinite: Int[Array, ""]
+    """Worlds that have turned non-finite so far."""
+    incident: Any
+    """`(env state before, action)` of the last of them."""
+
+
+def start(env: Env, key: Key[Array, ""], num_envs: int) -> Episodes:
+    """`num_envs` worlds at the beginning of an episode each."""
+    state = jax.vmap(env.reset)(jax.random.split(key, num_envs))
+    zero = jnp.zeros_like(state.reward)
+    never = jnp.full_like(zero, jnp.nan)
+    nothing = jax.tree.map(lambda x: x[0], state.pipeline_state), jnp.zeros(env.action_size, zero.dtype)
+    return Episodes(state, jnp.zeros(num_envs, jnp.int32), zero, never, never, jnp.int32(0), nothing)
+
+
+def _where(mask: Bool[Array, " N"], yes: Any, no: Any) -> Any:
+    return jax.tree.map(lambda a, b: jnp.where(_like(mask, b), a, b), yes, no)
+
+
+def _like(mask: Bool[Array, " N"], x: Array) -> Array:
+    return mask.reshape(mask.shape + (1,) * (x.ndim - 1))
+
+
+def _finite(tree: Any) -> Bool[Array, " N"]:
+    """Which worlds have only finite numbers."""
+    leaves = [x for x in jax.tree.leaves(tree) if jnp.issubdtype(x.dtype, jnp.floating)]
+    return jnp.stack([jnp.isfinite(x).reshape(x.shape[0], -1).all(1) for x in leaves]).all(0)
+
+
+def _quarantine(step: Transition, sound: Bool[Array, " N"]) -> Transition:
+    """The step with no number in it that is not finite; an unsound one goes nowhere for reward 0."""
+    obs = jnp.where(jnp.isfinite(step.obs), step.obs, 0)
+    action, log_prob, reward = (jnp.where(_like(sound, x), x, 0) for x in (step.action, step.log_prob, step.reward))
+    next_obs = jnp.where(sound[:, None], step.next_obs, obs)
+    return step._replace(obs=obs, action=action, log_prob=log_prob, reward=reward, next_obs=next_obs)
+
+
+def _record(episodes: Episodes, attempt: Any, sound: Bool[Array, " N"]) -> Episodes:
+    """Count the unsound worlds and keep what the first of them attempted."""
+    world = jnp.argmin(sound)
+    incident = jax.tree.map(lambda new, old: jnp.where(sound.all(), old, new[world]), attempt, episodes.incident)
+    return episodes._replace(nonfinite=episodes.nonfinite + (~sound).sum(), incident=incident)
+
+
+def _advance(episodes: Episodes, after: Any, step: Transition, fresh: Episodes) -> Episodes:
+    """The worlds after a step: those whose episode ended begin a fresh one."""
+    done = step.terminated | step.truncated
+    steps, total = episodes.steps + 1, episodes.total + step.reward
+    state, now_steps, now_total = _where(done, (fresh.env, fresh.steps, fresh.total), (after, steps, total))
+    return episodes._replace(
+        env=state,
+        steps=now_steps,
+        total=now_total,
+        last_total=jnp.where(done, total, episodes.last_total),
+        last_steps=jnp.where(done, steps, episodes.last_steps),
+    )
+
+
+def rollout(
+    env: Env, act: Act, episodes: Episodes, key: Key[Array, ""], *, horizon: int, episode_length: int
+) -> tuple[Episodes, Transition]:
+    """`horizon` steps in every world. The action is clipped to the actuators' range before it acts, not in the record.
+
+    An episode that ends is followed by a fresh random one; `next_obs` stays the observation in which it ended. A world
+    whose action, state, reward or observation turns non-finite is in quarantine: its episode ends there as terminated
+    with reward 0, and no number of that step that is not finite leaves this function.
+    """
+    low, high = env.action_range
+
+    def one(episodes: Episodes, key: Key[Array, ""]):
+        act_key, reset_key = jax.random.split(key)
+        before = episodes.env
+        action, log_prob = act(act_key, before.obs)
+        after = jax.vmap(env.step)(before, jnp.clip(action, low, high))
+        sound = _finite((before.obs, action, log_prob, after.pipeline_state, after.reward, after.obs, after.done))
+        terminated = (after.done > 0) | ~sound
+        truncated = ~terminated & (episodes.steps + 1 >= episode_length)
+        step = Transition(before.obs, action, log_prob, after.reward, terminated, truncated, after.obs, sound)  # pyright: ignore[reportArgumentType]
+        step = _quarantine(step, sound)
+        episodes = _record(episodes, (before.pipeline_state, action), sound)
+        return _advance(episodes, after, step, start(env, reset_key, sound.shape[0])), step
+
+    return jax.lax.scan(one, episodes, jax.random.split(key, horizon))
+
+
+def evaluate(env: Env, act: Callable[[Array], Array], key: Key[Array, ""], *, episodes: int, episode_length: int) -> Float[Array, " E"]:
+    """Undiscounted returns of `act(obs [E, O]) -> action [E, A]` in independent episodes, side by side until all end."""
+    low, high = env.action_range
+
+    def going(carry):
+        _, _, alive, step = carry
+        return alive.any() & (step < episode_length)
+
+    def one(carry):
+        state, total, alive, step = carry
+        state = jax.vmap(env.step)(state, jnp.clip(act(state.obs), low, high))
+        total = total + jnp.where(alive, state.reward, 0)
+        return state, total, alive & (state.done == 0), step + 1
+
+    state = jax.vmap(env.reset)(jax.random.split(key, episodes))
+    carry = (state, jnp.zeros_like(state.reward), jnp.full(episodes, True), jnp.int32(0))
+    return jax.lax.while_loop(going, one, carry)[1]

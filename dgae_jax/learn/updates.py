@@ -1,0 +1,165 @@
+"""How parameters move: the surrogate objective, stochastic gradient steps on any loss, and the trust region."""
+
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+import optax
+from jaxtyping import Array, ArrayLike
+
+from dgae_jax.learn.types import Batch, Fit, Params, Part, Policy, Update
+from dgae_jax.maths import gaussian
+
+Loss = Callable[[Params, Batch], tuple[jax.Array, dict[str, jax.Array]]]
+"""`loss(params, batch) -> (scalar, info)`; info holds scalars worth logging."""
+
+
+def surrogate(policy: Policy, clip: ArrayLike = jnp.inf) -> Loss:
+    """−E[min(ρA, clip(ρ, 1 ± ε)A)], ρ = π(a|s)/π_old(a|s) (Schulman et al. 2017); without a clip, plain ρA.
+
+    At the policy that acted its gradient is that of −E[A log π] (Eq. gradient_obj_fcn).
+    """
+
+    def loss(params: Params, batch: Batch):
+        distribution = policy.apply(params, batch.obs)
+        log_ratio = jnp.where(batch.sound, gaussian.log_prob(distribution, batch.action) - batch.log_prob, 0)
+        ratio = jnp.exp(log_ratio)
+        clipped = jnp.clip(ratio, jnp.subtract(1, clip), jnp.add(1, clip))
+        gain = jnp.minimum(ratio * batch.advantage, clipped * batch.advantage)
+        info = {
+            "kl": (ratio - 1 - log_ratio).mean(),
+            "entropy": gaussian.entropy(distribution).mean(),
+            "clip_fraction": (jnp.abs(ratio - 1) > clip).mean(),
+        }
+        return -gain.mean(), info
+
+    return loss
+
+
+def sgd(loss: Loss, optimizer: optax.GradientTransformation, *, epochs: int, minibatches: int) -> Update:
+    """`epochs` passes over the shuffled batch in `minibatches` optimizer steps each.
+
+    A2C, PPO's policy step and every critic fit are this. The info holds the means over all steps.
+    """
+
+    def minibatch(fit: Fit, batch: Batch):
+        (value, info), gradient = jax.value_and_grad(loss, has_aux=True)(fit.params, batch)
+        updates, opt_state = optimizer.update(gradient, fit.opt_state, fit.params)
+        info = {"loss": value, "gradient_norm": optax.global_norm(gradient), **info}
+        return Fit(optax.apply_updates(fit.params, updates), opt_state), info
+
+    def step(key: jax.Array, fit: Fit, batch: Batch):
+        size = batch.obs.shape[0]
+        if size % minibatches:
+            raise ValueError(f"a batch of {size} samples does not divide into {minibatches} minibatches")
+
+        def epoch(fit: Fit, key: jax.Array):
+            order = jax.random.permutation(key, size).reshape(minibatches, -1)
+            return jax.lax.scan(lambda fit, rows: minibatch(fit, jax.tree.map(lambda x: x[rows], batch)), fit, order)
+
+        fit, infos = jax.lax.scan(epoch, fit, jax.random.split(key, epochs))
+        return fit, jax.tree.map(jnp.mean, infos)
+
+    return Update(optimizer.init, step)
+
+
+def trust_region(
+    policy: Policy, loss: Loss, *, radius: ArrayLike, damping: ArrayLike, cg_iterations: int, backtracks: int, fisher_every: int
+) -> Update:
+    """The natural gradient step to a KL radius, halved until KL and improvement are real (TRPO, Schulman et al. 2015).
+
+    The direction solves (F + damping) x = −∇loss by `cg_iterations` of conjugate gradient, with the Fisher matrix F of every
+    `fisher_every`-th sample. A step is taken only if KL(old ‖ new) ≤ `radius` and the loss falls; if none of 1 + `backtracks`
+    lengths is such a step, the parameters stay as they are, bit for bit.
+    """
+
+    def step(key: jax.Array, fit: Fit, batch: Batch):
+        old = fit.params
+        (start, info), gradient = jax.value_and_grad(loss, has_aux=True)(old, batch)
+        fisher = fisher_product(policy, old, batch.obs[::fisher_every], damping)
+        direction, _ = jax.scipy.sparse.linalg.cg(fisher, jax.tree.map(jnp.negative, gradient), maxiter=cg_iterations, tol=1e-10)
+        curvature = optax.tree.vdot(direction, fisher(direction))
+        longest = jnp.sqrt(2 * radius / curvature)
+
+        def attempt(halvings):
+            new = jax.tree.map(lambda p, d: p + longest * 0.5**halvings * d, old, direction)
+            moved = gaussian.kl(policy.apply(old, batch.obs), policy.apply(new, batch.obs)).mean()
+            value, info = loss(new, batch)
+            return new, value, moved, (moved <= radius) & (value < start), info["entropy"]
+
+        def search(carry):
+            halvings, _ = carry
+            return halvings + 1, attempt(halvings + 1)
+
+        def unfinished(carry):
+            halvings, (*_, accepted, _) = carry
+            return ~accepted & (halvings < backtracks)
+
+        halvings, (new, value, moved, accepted, entropy) = jax.lax.while_loop(unfinished, search, (jnp.int32(0), attempt(jnp.int32(0))))
+        params = jax.tree.map(lambda n, o: jnp.where(accepted, n, o), new, old)
+        info = {
+            "loss": start,
+            "gradient_norm": optax.global_norm(gradient),
+            "kl": jnp.where(accepted, moved, 0),
+            "entropy": jnp.where(accepted, entropy, info["entropy"]),
+            "improvement": jnp.where(accepted, start - value, 0),
+            "accepted": accepted.astype(start.dtype),
+            "halvings": halvings.astype(start.dtype),
+        }
+        return Fit(params, fit.opt_state), info
+
+    return Update(lambda params: (), step)
+
+
+def fisher_product(policy: Policy, params: Params, obs: Array, damping: ArrayLike) -> Callable[[Params], Params]:
+    """v ↦ (F + damping) v, F the Hessian of the mean KL from `params` at `params`, without forming it."""
+    here = policy.apply(params, obs)
+
+    def slope(params: Params) -> Params:
+        return jax.grad(lambda p: gaussian.kl(here, policy.apply(p, obs)).mean())(params)
+
+    def product(v: Params) -> Params:
+        return jax.tree.map(lambda f, v: f + damping * v, jax.jvp(slope, (params,), (v,))[1], v)
+
+    return product
+
+
+OPTIMIZERS = {
+    "adam": lambda rate: optax.adam(rate, eps=1e-5),  # ε as in the implementations of PPO (Andrychowicz et al. 2021)
+    "rmsprop": lambda rate: optax.rmsprop(rate, decay=0.99, eps=1e-5, eps_in_sqrt=False),  # as stable-baselines3
+}
+
+
+def descent(name: str, learning_rate, *, final_fraction, gradient_steps, max_norm) -> optax.GradientTransformation:
+    """An optimizer behind a global-norm clip, its rate falling linearly to `final_fraction` of its start over `gradient_steps`.
+
+    All four numbers may be traced.
+    """
+
+    def schedule(count: ArrayLike) -> Array:
+        done = jnp.minimum(jnp.divide(count, gradient_steps), 1.0)
+        return learning_rate * (1 + (final_fraction - 1) * done)
+
+    return optax.chain(optax.clip_by_global_norm(max_norm), OPTIMIZERS[name](schedule))
+
+
+def descend(
+    loss: Loss, iterations: ArrayLike, *, optimizer, learning_rate, learning_rate_end, epochs: int, minibatches: int, max_grad_norm
+) -> Update:
+    """`sgd` on a loss, with the schedule of a run of so many iterations."""
+    steps = iterations * epochs * minibatches
+    rule = descent(optimizer, learning_rate, final_fraction=learning_rate_end, gradient_steps=steps, max_norm=max_grad_norm)
+    return sgd(loss, rule, epochs=epochs, minibatches=minibatches)
+
+
+DESCENT = ("optimizer", "learning_rate", "learning_rate_end", "epochs", "minibatches", "max_grad_norm")
+
+UPDATES = {
+    "clip": Part(lambda policy, n, *, clip, **fit: descend(surrogate(policy, clip), n, **fit), ("clip", *DESCENT)),
+    "gradient": Part(lambda policy, n, **fit: descend(surrogate(policy), n, **fit), DESCENT),
+    "trust-region": Part(
+        lambda policy, n, **search: trust_region(policy, surrogate(policy), **search),
+        ("radius", "damping", "cg_iterations", "backtracks", "fisher_every"),
+    ),
+}
+"""How a policy improves: `build(policy, iterations, **options) -> Update`."""

@@ -1,0 +1,1 @@
+"""One run on disk: the loop, checkpoints, metrics, evaluations, progress and signals."""

@@ -1,0 +1,127 @@
+"""`manifest.json`: by what a run was computed, and what of that is different now."""
+
+import importlib.metadata
+import json
+import os
+import platform
+import subprocess
+import sys
+import time
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import jax
+
+from dgae_jax.run import files
+from dgae_jax.run.options import RunOptions, from_dict, to_dict
+
+_VERSIONS_OF = ("dgae_jax", "jax", "jaxlib", "flax", "optax", "brax", "mujoco", "mujoco-mjx", "gymnasium", "numpy")
+
+_SETTINGS = ("jax_enable_x64", "jax_default_prng_impl", "jax_threefry_partitionable", "jax_default_matmul_precision")
+"""Of JAX, which the environment may change and on which the bits depend."""
+
+
+def write(run_dir: Path, options: RunOptions) -> None:
+    """The first part of a run."""
+    files.write_json(run_dir / "manifest.json", {**_now(), "options": to_dict(options), "resumed": []})
+
+
+def add(run_dir: Path, options: RunOptions) -> None:
+    """A part that continues it."""
+    before = _read(run_dir)
+    parts = [*_resumed(before), {**_now(), "options": to_dict(options)}]
+    files.write_json(run_dir / "manifest.json", {**before, "resumed": parts})
+
+
+def options(run_dir: Path) -> RunOptions:
+    """The options of the last part of the run, as far as they can be read."""
+    return from_dict(_last(run_dir).get("options"))
+
+
+def changes(run_dir: Path) -> list[str]:
+    """What decides the bits of a result and is not what it was in the last part of the run."""
+    was, now = _deciding(_last(run_dir)), _deciding(_now())
+    return [f"{name} {value} (was {was.get(name)})" for name, value in now.items() if was.get(name) != value]
+
+
+def _deciding(part: dict[str, Any]) -> dict[str, Any]:
+    found = {name: part.get(name) for name in ("device", "devices", "cores", "git_revision")}
+    for table in (part.get("settings"), part.get("versions")):
+        found |= table if isinstance(table, dict) else {}
+    return found
+
+
+def _last(run_dir: Path) -> dict[str, Any]:
+    before = _read(run_dir)
+    part = (_resumed(before) or [before])[-1]
+    return part if isinstance(part, dict) else {}
+
+
+def _read(run_dir: Path) -> dict[str, Any]:
+    """The manifest; empty if there is none that can be understood."""
+    try:
+        found = json.loads((run_dir / "manifest.json").read_text())
+    except (OSError, ValueError, RecursionError):
+        return {}
+    return found if isinstance(found, dict) else {}
+
+
+def _resumed(manifest: dict[str, Any]) -> list[Any]:
+    found = manifest.get("resumed")
+    return found if isinstance(found, list) else []
+
+
+def _now() -> dict[str, Any]:
+    return {
+        "started": time.strftime("%Y-%m-%dT%H:%M:%S%z"),
+        "command": sys.argv,
+        "git_revision": _git_revision(),
+        "python": platform.python_version(),
+        "platform": platform.platform(),
+        "device": f"{jax.default_backend()}: {_model()}",
+        "devices": jax.device_count(),
+        "cores": _cores(),
+        "settings": {name: getattr(jax.config, name, None) for name in _SETTINGS} | {"XLA_FLAGS": os.environ.get("XLA_FLAGS")},
+        "versions": {name: _version(name) for name in _VERSIONS_OF},
+    }
+
+
+def _model() -> str:
+    """Of the device; JAX calls every CPU the same, but compiles for the one it finds."""
+    if jax.default_backend() != "cpu":
+        return jax.devices()[0].device_kind
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+        return next(line.partition(":")[2].strip() for line in lines if line.startswith("model name"))
+    except (OSError, StopIteration):
+        return platform.processor() or platform.machine()
+
+
+def _cores() -> int | None:
+    """Cores this process may use: on a CPU their number decides how sums are split, and so their rounding."""
+    if jax.default_backend() != "cpu":
+        return None
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+
+
+@cache
+def _version(name: str) -> str | None:
+    try:
+        return importlib.metadata.version(name)
+    except importlib.metadata.PackageNotFoundError:
+        return None
+
+
+@cache
+def _git_revision() -> str | None:
+    """The commit of the source tree, `+` appended where files differ from it; None outside a checkout."""
+
+    def git(*words: str) -> str:
+        done = subprocess.run(["git", *words], cwd=Path(__file__).parent, capture_output=True, text=True, check=True, timeout=5)
+        return done.stdout.strip()
+
+    try:
+        return git("rev-parse", "HEAD") + ("+" if git("status", "--porcelain", "--untracked-files=no") else "")
+    except (OSError, subprocess.SubprocessError):
+        return None

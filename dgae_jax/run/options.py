@@ -1,0 +1,59 @@
+"""What a user may choose about a run beside its configuration."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from dgae_jax.configs.config import ConfigError, flag
+
+
+@dataclass(frozen=True)
+class RunOptions:
+    """What a run leaves on this machine; nothing here changes its result."""
+
+    run_dir: Path | None = None
+    """Directory to write, new or empty; by default runs/ENV-ALGO-SEED-TIME [path]."""
+    cache_dir: str = "~/.cache/dgae_jax"
+    """Where compiled programs are kept between runs (JAX keeps those of jax, not of native); none disables [path]."""
+    checkpoint_every: int = 200_000
+    """Samples of each run between checkpoints, which are evaluated too; one is always saved at the end [environment steps]."""
+    keep_checkpoints: int = 3
+    """The newest checkpoints that are kept, beside the one with the best evaluation [files]."""
+    resume: Path | None = None
+    """Continue the run in this directory, bit for bit, with its flags where none are given [path]."""
+    inexact: bool = False
+    """Let --resume continue with another --physics, device, number of cores or versions: the same in the statistical sense only."""
+    max_nonfinite: int = 10
+    """Updates in a row that may turn out non-finite, and be left out, before the run is stopped [iterations]."""
+    episodes: int = 20
+    """Episodes of every evaluation in Gymnasium, per run [episodes]."""
+    debug_nonfinite: bool = False
+    """Write the state and action of worlds that turn non-finite to nonfinite/ in the run directory, for replay."""
+
+
+def validate_options(options: RunOptions) -> None:
+    """Raise `ConfigError` for the first option that cannot be."""
+    for name in ("checkpoint_every", "keep_checkpoints", "max_nonfinite", "episodes"):
+        value = getattr(options, name)
+        if value < 1:
+            raise ConfigError(f"{flag(name)} {value}: must be a whole number of at least 1")
+    if options.resume is not None and options.run_dir is not None:
+        raise ConfigError(f"--run-dir {options.run_dir}: must be left out: --resume writes to {options.resume}")
+    if options.resume is None and options.inexact:
+        raise ConfigError("--inexact True: must be left out without --resume")
+
+
+_KEPT = ("checkpoint_every", "keep_checkpoints", "max_nonfinite", "episodes", "debug_nonfinite")
+"""What a run goes on with when it is resumed."""
+
+
+def to_dict(options: RunOptions) -> dict[str, Any]:
+    """What a run goes on with, for JSON."""
+    return {name: getattr(options, name) for name in _KEPT}
+
+
+def from_dict(data: Any) -> RunOptions:
+    """What `to_dict` wrote; defaults for all else."""
+    found = data if isinstance(data, dict) else {}
+    usual = to_dict(RunOptions())
+    return RunOptions(**{name: found[name] for name in _KEPT if type(found.get(name)) is type(usual[name])})

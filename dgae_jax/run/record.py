@@ -1,0 +1,102 @@
+"""What a run leaves in its directory while it trains: metrics, checkpoints, evaluations, a curve."""
+
+import gc
+import time
+from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+
+from dgae_jax.configs.config import Config
+from dgae_jax.envs.registry import BRAX
+from dgae_jax.learn.types import TrainState
+from dgae_jax.physics.engine import PhysicsState
+from dgae_jax.run import checkpoint, curve
+from dgae_jax.run.evaluation import EvaluationsFile, evaluate_state
+from dgae_jax.run.metrics import MetricsFile
+from dgae_jax.run.options import RunOptions
+from dgae_jax.run.signals import Stopped
+
+
+class Record:
+    """The growing files of one run directory, begun anew or continued behind the iterations `done`.
+
+    Checkpoints and plots are written beside the training, one after the other; a failure is raised by the call after.
+    """
+
+    def __init__(self, run_dir: Path, config: Config, options: RunOptions, done: int):
+        self.run_dir, self.config, self.options = run_dir, config, options
+        (run_dir / "checkpoints").mkdir(exist_ok=True)
+        self.metrics = MetricsFile(run_dir / "metrics.jsonl", config, done)
+        self.evaluations = EvaluationsFile(run_dir / "evaluations.jsonl")
+        self.evaluations.cut(done * config.samples, config.num_seeds)
+        self.began = time.monotonic() - self.metrics.seconds
+        self.beside, self.pending = ThreadPoolExecutor(1), Future()
+        self.pending.set_result(None)
+
+    def __enter__(self) -> "Record":
+        return self
+
+    def __exit__(self, kind: Any, *_) -> None:
+        self.beside.shutdown()
+        if kind is None or issubclass(kind, Stopped):
+            self.pending.result()
+
+    def _write(self, file: Callable, *args) -> None:
+        self.pending.result()
+        self.pending = self.beside.submit(file, *args)
+
+    @property
+    def steps(self) -> int:
+        """Samples of each run so far."""
+        return self.metrics.iteration * self.config.samples
+
+    @property
+    def evaluated(self) -> bool:
+        """Whether the state after so many samples was evaluated."""
+        return self.evaluations.has(self.steps)
+
+    def append(self, state: TrainState, measured: dict[str, Any], count: int) -> float | None:
+        """Add `count` iterations to the metrics; the mean return of the last one, if there is any yet."""
+        rows = self.metrics.append(measured, count, time.monotonic() - self.began)
+        if self.options.debug_nonfinite:
+            self._save_incidents(state, {row["seed"] for row in rows if row["nonfinite"]})
+        returns = [row["episode_return"] for row in rows[-self.config.num_seeds :] if row["episode_return"] is not None]
+        return float(np.mean(returns)) if returns else None
+
+    def save(self, state: TrainState) -> None:
+        """Write a checkpoint, from a copy: the state itself may be consumed meanwhile."""
+        keep = self.options.keep_checkpoints, self.evaluations.best
+        self._write(checkpoint.save, self.run_dir / "checkpoints", self.config, checkpoint.arrays_of(state), self.steps, *keep)
+
+    def evaluate(self, state: TrainState) -> dict[str, Any]:
+        """Returns of the policies as they are now, noted and drawn."""
+        engine = "jax" if self.config.env.startswith(BRAX) else "gymnasium"
+        result = evaluate_state(state, self.config, engine=engine, episodes=self.options.episodes)
+        if not self.evaluated:
+            self.evaluations.append(self.steps, result)
+        self.draw()
+        return result
+
+    def draw(self) -> None:
+        """The learning curve so far."""
+        title = f"{self.config.env}-{self.config.env_version}, {self.config.algo}, {self.config.physics}"
+        self._write(_plot, self.run_dir / "curve.png", *self.metrics.curve(), title, self.evaluations.points())
+
+    def _save_incidents(self, state: TrainState, seeds: set[int]) -> None:
+        """The last state and action from which a world turned non-finite, per run and dispatch: arrays by name, and action."""
+        for seed in sorted(seeds):
+            world, action = jax.tree.map(lambda x, i=seed - self.config.seed: np.asarray(x[i]), state.episodes.incident)
+            names = world._fields if isinstance(world, PhysicsState) else range(len(jax.tree.leaves(world)))
+            arrays = {str(name): leaf for name, leaf in zip(names, jax.tree.leaves(world), strict=True)}
+            directory = self.run_dir / "nonfinite"
+            directory.mkdir(exist_ok=True)
+            np.savez(directory / f"steps_{self.steps:012d}_seed_{seed}.npz", **arrays, action=action)
+
+
+def _plot(path: Path, *data) -> None:
+    curve.save(curve.learning_curve(*data), path)
+    gc.collect()  # a figure is full of cycles, and left alone figures gather: 3 MB each

@@ -1,0 +1,266 @@
+"""The commands as a user meets them."""
+
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+
+import pytest
+
+from dgae_jax.run import metrics
+from tests.helpers import ROOT, TINY, command
+
+
+@pytest.fixture
+def run(monkeypatch, capsys):
+    def run(name, *argv):
+        monkeypatch.setattr(sys, "argv", [f"{name}.py", *map(str, argv)])
+        try:
+            code = command(name)()
+        except SystemExit as stop:
+            code = stop.code
+        return code, *capsys.readouterr()
+
+    return run
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory):
+    """A finished tiny run: its directory and what it printed."""
+    directory = tmp_path_factory.mktemp("runs") / "tiny"
+    argv = ["--total-steps", "1000", "--run-dir", str(directory), "--episodes", "3", "--checkpoint-every", "300", *TINY]
+    done = subprocess.run(
+        [sys.executable, "experiments/train.py", *argv], cwd=ROOT, capture_output=True, text=True, check=True, timeout=300
+    )
+    return directory, done.stdout.splitlines(), done.stderr
+
+
+def test_training_writes_a_whole_run_directory(trained):
+    directory, _, _ = trained
+    assert {p.name for p in directory.iterdir()} == {
+        "config.json", "manifest.json", "metrics.jsonl", "evaluations.jsonl", "checkpoints", "curve.png", "evaluation.json",
+    }  # fmt: skip
+    assert (directory / "curve.png").read_bytes().startswith(b"\x89PNG")
+    config = json.loads((directory / "config.json").read_text())
+    assert config["critic"]["target"] == "sr-lambda"
+
+
+def test_the_budget_is_never_exceeded_and_the_first_line_says_how_much_is_used(trained):
+    directory, lines, _ = trained
+    assert lines[0] == "hopper-v4 dppo on native: 15 iterations × 64 samples = 960 of 1,000 steps"
+    rows = metrics.read(directory / "metrics.jsonl")
+    assert [row["steps"] for row in rows] == list(range(64, 961, 64))
+    assert all("episode_return" in row for row in rows)
+
+
+def test_progress_is_plain_lines_when_piped(trained):
+    _, lines, errors = trained
+    assert re.search(r"^960 of 960 steps  [\d,]+ steps/s  return [\d.,]+  0:00:00 left$", lines[-2])
+    assert "\x1b" not in "".join(lines)
+    assert errors == ""
+
+
+def test_the_last_line_is_the_return_in_gymnasium_and_where_the_files_are(trained):
+    directory, lines, _ = trained
+    result = json.loads((directory / "evaluation.json").read_text())
+    assert result["engine"] == "gymnasium"
+    assert result["episodes"] == len(result["returns"]) == 3
+    mean, std = f"{result['return_mean']:,.1f}", f"{result['return_std']:,.1f}"
+    assert lines[-1] == (
+        f"return {mean} ± {std} over 3 episodes of the deterministic policy in Hopper-v4 (gymnasium); files in {directory}"
+    )
+
+
+def test_checkpoints_are_saved_and_evaluated_along_the_way_and_at_the_end(trained):
+    directory, _, _ = trained
+    evaluations = metrics.read(directory / "evaluations.jsonl")
+    assert [row["steps"] for row in evaluations] == [256, 512, 768, 960]
+    best = max(evaluations[:-1], key=lambda row: (row["return_mean"], row["steps"]))["steps"]
+    kept = sorted({best, 512, 768, 960})
+    assert [p.name for p in sorted((directory / "checkpoints").iterdir())] == [f"steps_{steps:012d}.msgpack" for steps in kept]
+
+
+def test_the_best_checkpoint_is_evaluated_if_asked_for(trained, run, tmp_path):
+    rows = metrics.read(trained[0] / "evaluations.jsonl")
+    code, _, _ = run("evaluate", trained[0], "--checkpoint", "best", "--episodes", 3, "--out", tmp_path / "best.json")
+    result = json.loads((tmp_path / "best.json").read_text())
+    assert code == 0
+    assert result["return_mean"] == pytest.approx(max(row["return_mean"] for row in rows))
+    assert result["checkpoint"] in {f"steps_{row['steps']:012d}.msgpack" for row in rows}
+
+
+@pytest.mark.parametrize("engine", ["gymnasium", "native"])
+def test_evaluate_loads_a_run_and_writes_json(engine, trained, run):
+    directory, _, _ = trained
+    code, out, _ = run("evaluate", directory, "--engine", engine, "--episodes", 4)
+    assert code == 0
+    result = json.loads((directory / f"evaluation-{engine}.json").read_text())
+    assert result["engine"] == engine
+    assert len(result["returns"]) == 4
+    assert f"return {result['return_mean']:,.1f} ± {result['return_std']:,.1f} over 4 episodes" in out
+
+
+def test_evaluating_twice_gives_the_same_returns(trained, run, tmp_path):
+    results = []
+    for name in ("a.json", "b.json"):
+        run("evaluate", trained[0], "--episodes", 3, "--out", tmp_path / name)
+        results.append(json.loads((tmp_path / name).read_text())["returns"])
+    assert results[0] == results[1] == json.loads((trained[0] / "evaluation.json").read_text())["returns"]
+
+
+@pytest.mark.parametrize(
+    ("argv", "message"),
+    [
+        (["--foo", "3"], r"Unrecognized options: --foo, 3"),
+        (["--policy.clp", "3"], r"Unrecognized options: --policy.clp, 3 Perhaps you meant: --policy.clip"),
+        (["--num-envs", "many"], r"--num-envs: invalid literal for int\(\) with base 10: 'many'"),
+        (["--num-envs"], r"--num-envs"),
+        (["--num-envs", "0"], r"--num-envs 0: must be a whole number of at least 1"),
+        (["--env", "hoper"], r"--env hoper: must be one of ant, hopper, swimmer, walker2d"),
+        (["--algo", "sac"], r"--algo sac: must be one of ppo, dppo"),
+        (["--gamma", "1.5"], r"--gamma 1.5: must be a number from 0 to 1"),
+        (["--lam", "-1"], r"--lam -1.0: must be a number from 0 to 1"),
+        (["--policy.minibatches", "7"], r"--policy.minibatches 7: must be a divisor of num_envs \* horizon = 2,048"),
+        (["--total-steps", "2000"], r"--total-steps 2000: must be at least one iteration of num_envs \* horizon = 2,048 samples"),
+        (["--run-dir", "/dev/null/below"], r"--run-dir /dev/null/below: must be a directory that can be written"),
+        (["--cache-dir", "/dev/null/below"], r"--cache-dir /dev/null/below: must be a directory that can be written, or none"),
+        (["--episodes", "0"], r"--episodes 0: must be a whole number of at least 1"),
+        (["--checkpoint-every", "0"], r"--checkpoint-every 0: must be a whole number of at least 1"),
+        (["--keep-checkpoints", "0"], r"--keep-checkpoints 0: must be a whole number of at least 1"),
+        (["--num-seeds", "0"], r"--num-seeds 0: must be a whole number of at least 1"),
+        (["--inexact"], r"--inexact True: must be left out without --resume"),
+    ],
+)  # fmt: skip
+def test_bad_input_is_one_line_on_stderr_and_exit_code_2(argv, message, run, monkeypatch, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    code, out, err = run("train", *argv)
+    assert code == 2
+    assert out == ""
+    assert re.fullmatch(rf"error: .*{message}.*\n", err)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_used_run_directory_is_refused_and_left_alone(trained, run):
+    directory, _, _ = trained
+    before = (directory / "metrics.jsonl").read_bytes()
+    code, _, err = run("train", "--run-dir", directory, "--cache-dir", "none")
+    assert (code, err) == (2, f"error: --run-dir {directory}: must be a new or empty directory\n")
+    assert (directory / "metrics.jsonl").read_bytes() == before
+
+
+@pytest.mark.parametrize(
+    ("argv", "message"),
+    [
+        (["--resume", "RUN", "--preset", "paper"], r"--preset paper: must be left out: all settings start from RUN"),
+        (["--resume", "RUN", "--config", "FILE"], r"--config FILE: must be left out: all settings start from RUN"),
+        (["--config", "FILE", "--preset", "paper"], r"--preset paper: must be left out: all settings start from FILE"),
+        (["--resume", "RUN", "--run-dir", "there"], r"--run-dir there: must be left out: --resume writes to RUN"),
+        (["--resume", "RUN", "--gamma", "0.5"], r"--gamma 0\.5: must be 0\.99 as in RUN, or left out"),
+    ],
+)
+def test_flags_that_would_have_no_effect_are_refused(argv, message, trained, run, monkeypatch, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    places = {"RUN": str(trained[0]), "FILE": str(trained[0] / "config.json")}
+    code, out, err = run("train", *(places.get(word, word) for word in argv), "--cache-dir", "none")
+    for name, place in sorted(places.items()):  # FILE first, which begins like RUN
+        err = err.replace(place, name)
+    assert (code, out) == (2, "")
+    assert re.fullmatch(rf"error: {message}\n", err)
+
+
+def test_a_device_that_is_not_there_is_refused_in_one_line(tmp_path):
+    done = subprocess.run(
+        [sys.executable, "experiments/train.py", "--run-dir", str(tmp_path / "run")], cwd=ROOT, capture_output=True, text=True,
+        env={**os.environ, "JAX_PLATFORMS": "abacus"},
+    )  # fmt: skip
+    assert (done.returncode, done.stdout) == (2, "")
+    assert re.fullmatch(r"error: JAX_PLATFORMS=abacus: must name a device that JAX finds here, cpu for one .*\n", done.stderr)
+    assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.parametrize(("name", "work"), [("train", "train"), ("evaluate", "evaluate_run")])
+def test_an_interrupt_where_nothing_is_at_stake_ends_with_130_and_one_line(name, work, trained, run, monkeypatch, tmp_path):
+    def interrupted(*_, **__):
+        raise KeyboardInterrupt
+
+    main = command(name)
+    monkeypatch.setitem(main.__globals__, work, interrupted)
+    monkeypatch.setattr(sys.modules[__name__], "command", lambda _: main)
+    code, out, err = run(name, *([trained[0]] if name == "evaluate" else ["--run-dir", tmp_path / "run"]))
+    assert (code, out) == (130, "")
+    assert re.fullmatch(r"stopped by SIGINT.*\n", err)
+
+
+def test_a_resumed_run_starts_from_its_own_flags(trained, monkeypatch):
+    main, got = command("train"), []
+    monkeypatch.setitem(main.__globals__, "resume", lambda config, options: got.append(options) or 0)
+    monkeypatch.setattr(sys, "argv", ["train.py", "--resume", str(trained[0]), "--episodes", "5"])
+    assert main() == 0
+    assert (got[0].checkpoint_every, got[0].episodes, got[0].keep_checkpoints) == (300, 5, 3)
+
+
+def test_an_output_that_is_no_file_is_left_alone(trained, run, tmp_path):
+    os.mkfifo(tmp_path / "pipe")
+    (tmp_path / "link").symlink_to(tmp_path / "pipe")
+    for name in ("pipe", "link", "."):
+        code, _, err = run("evaluate", trained[0], "--out", tmp_path / name)
+        assert (code, err) == (2, f"error: --out {tmp_path / name}: must be a file, not a directory, a link or a device\n")
+    assert (tmp_path / "pipe").is_fifo()
+
+
+@pytest.mark.parametrize(
+    ("argv", "message"),
+    [
+        (["nowhere"], r"nowhere/config.json: must be a configuration that can be read \(No such file or directory\)"),
+        ([], r"RUN_DIR|PATH"),
+        ([".", "--engine", "ode"], r"'ode'.*'gymnasium', 'native', 'jax'"),
+        ([".", "--episodes", "0"], r"--episodes 0: must be a whole number of at least 1"),
+    ],
+)
+def test_evaluate_refuses_bad_input_in_one_line(argv, message, run, monkeypatch, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    code, out, err = run("evaluate", *argv)
+    assert (code, out) == (2, "")
+    assert re.fullmatch(rf"error: .*({message}).*\n", err)
+
+
+def test_help_explains_every_flag(run):
+    code, out, _ = run("train", "--help")
+    assert code == 0
+    for flag in ("--env", "--algo", "--physics", "--seed", "--num-seeds", "--total-steps", "--num-envs", "--gamma", "--lam", "--run-dir",
+                 "--cache-dir", "--critic.target", "--policy.clip"):  # fmt: skip
+        assert re.search(rf"{flag}\b", out)
+
+
+@pytest.mark.parametrize(("kind", "code"), [(signal.SIGTERM, 143), (signal.SIGINT, 130)])
+def test_a_signal_saves_a_checkpoint_and_ends_with_its_code(kind, code, tmp_path):
+    argv = ["--total-steps", "100_000_000", "--run-dir", str(tmp_path / "run"), *TINY]
+    process = subprocess.Popen([sys.executable, "experiments/train.py", *argv], cwd=ROOT, stdout=subprocess.PIPE, text=True)
+    lines = tmp_path / "run" / "metrics.jsonl"
+    deadline = time.monotonic() + 120
+    while not (lines.exists() and lines.stat().st_size) and time.monotonic() < deadline:
+        time.sleep(0.2)
+    process.send_signal(kind)
+    out, _ = process.communicate(timeout=60)
+    assert process.returncode == code
+    assert f"stopped by {kind.name}; continue with --resume" in out
+    steps = metrics.read(lines)[-1]["steps"]
+    assert (tmp_path / "run" / "checkpoints" / f"steps_{steps:012d}.msgpack").exists()
+
+
+def test_importing_the_package_pulls_in_no_plotting_no_gymnasium_no_web_server_and_prints_nothing():
+    code = "import dgae_jax, sys; print([m for m in ('matplotlib', 'gymnasium', 'flask', 'tyro', 'IPython') if m in sys.modules])"
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True, env={**os.environ, "JAX_PLATFORMS": "cpu"}
+    )
+    assert done.stdout == "[]\n"
+
+
+def test_public_names_exist_and_are_documented():
+    import dgae_jax
+
+    for name in dgae_jax.__all__:
+        assert getattr(dgae_jax, name).__doc__, name

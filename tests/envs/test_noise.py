@@ -1,0 +1,51 @@
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose, assert_array_equal
+
+import dgae_jax as dg
+from dgae_jax.configs.build import make_task
+from dgae_jax.envs.noise import Noisy
+from dgae_jax.learn.rollout import rollout, start
+from tests.probes import Constant, Counter
+
+
+def collect(env, key, horizon=400):
+    def act(key, obs):
+        return jnp.zeros((obs.shape[0], 1)), jnp.zeros(obs.shape[0])
+
+    return rollout(env, act, start(env, key, 16), key, horizon=horizon, episode_length=50)[1]
+
+
+def test_without_noise_the_task_is_left_as_it_is():
+    assert not isinstance(make_task(dg.Config(env="hopper", physics="native")), Noisy)
+    assert isinstance(make_task(dg.Config(env="hopper", physics="native", noise=dg.NoiseConfig(reward=1.0))), Noisy)
+
+
+def test_reward_noise_has_its_deviation_and_is_drawn_afresh(key):
+    reward = np.asarray(collect(Noisy(Constant(), reward=0.5), key).reward)
+    assert_allclose([reward.mean(), reward.std()], [1, 0.5], atol=0.03)
+    assert len(np.unique(reward)) > 0.99 * reward.size
+
+
+def test_observation_noise_is_seen_and_does_not_enter_the_task(key):
+    step = collect(Noisy(Counter(), observation=0.1), key)
+    truth = jnp.round(step.obs[..., 0])
+    assert_allclose((step.obs[..., 0] - truth).std(), 0.1, atol=0.01)
+    assert_array_equal(step.reward, truth + 1)  # the counter counts true steps
+
+
+def test_action_noise_reaches_the_task_and_not_the_record(key):
+    env = Noisy(Counter(), action=0.2)
+    state = jax.vmap(env.reset)(jax.random.split(key, 500))
+    after = jax.vmap(env.step)(state, jnp.ones((500, 1)))
+    assert_allclose([after.metrics["action"].mean(), after.metrics["action"].std()], [1, 0.2], atol=0.03)
+
+
+def test_initial_noise_moves_the_start_of_our_tasks_and_is_refused_elsewhere(key):
+    env = Noisy(dg.make_env("swimmer", physics="native", reset_noise_scale=0.0), initial=0.3)
+    qpos = jax.vmap(env.reset)(jax.random.split(key, 500)).pipeline_state.qpos
+    assert_allclose(qpos.std(0), 0.3, atol=0.03)
+    with pytest.raises(ValueError, match="our own tasks"):
+        Noisy(Constant(), initial=0.1)

@@ -1,0 +1,41 @@
+"""What several test files share: a small configuration, the commands, files made by hand."""
+
+import hashlib
+import importlib
+import json
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+
+import dgae_jax as dg
+from dgae_jax.run import checkpoint
+
+ROOT = Path(__file__).parent.parent
+
+SMALL = dg.Config(
+    physics="native",
+    total_steps=64 * 20,
+    num_envs=4,
+    horizon=16,
+    policy=dg.PolicyConfig(hidden=(8,), epochs=2, minibatches=4),
+    critic=dg.CriticConfig(hidden=(8,), epochs=2, minibatches=4, quantiles=8),
+)
+
+TINY = ["--physics", "native", "--num-envs", "4", "--horizon", "16", "--policy.minibatches", "4", "--critic.minibatches", "4",
+        "--policy.hidden", "8", "--critic.hidden", "8"]  # fmt: skip
+
+
+def command(name):
+    """The `main` of a command line."""
+    return importlib.import_module(f"dgae_jax.cli.{name}").main
+
+
+def signed(arrays):
+    """Any bytes with the header of a checkpoint."""
+    return json.dumps({"schema": checkpoint.SCHEMA, "sha256": hashlib.sha256(arrays).hexdigest()}).encode() + b"\n" + arrays
+
+
+def distance(a, b):
+    """The largest difference of two trees."""
+    return max(jax.tree.leaves(jax.tree.map(lambda x, y: float(jnp.abs(x - y).max()), a, b)))

@@ -1,0 +1,33 @@
+import jax
+import jax.numpy as jnp
+from numpy.testing import assert_allclose
+
+from dgae_jax.learn import diagnostics
+from dgae_jax.maths.transport import quantile_midpoints
+
+
+def test_a_perfect_critic_of_a_normal_reward_is_calibrated(key):
+    # one-step episodes with a standard normal reward: quantiles Φ⁻¹(τ), outcome the reward
+    k, shape = 64, (500, 8)
+    reward = jax.random.normal(key, shape)
+    quantiles = jnp.broadcast_to(jax.scipy.stats.norm.ppf(quantile_midpoints(k)), (*shape, k))
+    zero = jnp.zeros(shape)
+    got = diagnostics.of_critic(reward, zero, zero, quantiles, jnp.zeros_like(quantiles))
+    assert_allclose(got["critic/coverage_90"], 0.9, atol=0.015)
+    assert_allclose([got["critic/pit_mean"], got["critic/pit_deviation"]], [0.5, 1 / 12**0.5], atol=0.015)
+    assert_allclose(got["critic/wasserstein"], 2 / jnp.pi**0.5, atol=0.03)  # E|X − Y| of two standard normals
+    assert got["critic/crossing"] == 0
+
+
+def test_similar_means_and_different_shapes_are_counted_and_shifts_are_not():
+    narrow, wide, shifted = jnp.array([-1.0, 1.0]), jnp.array([-3.0, 3.0]), jnp.array([1.0, 3.0])
+    quantiles, next_quantiles = jnp.stack([narrow, narrow, narrow])[:, None], jnp.stack([wide, shifted, wide + 0.5])[:, None]
+    one, zero = jnp.ones((3, 1)), jnp.zeros((3, 1))
+    # d = 0 against W₁ = 2, d = W₁ = 2, d = 0.5 against W₁ = 2
+    assert_allclose(diagnostics.of_critic(zero, one, zero, quantiles, next_quantiles)["critic/similar_means"], 1 / 3)
+
+
+def test_crossing_counts_neighbours_in_the_wrong_order():
+    quantiles = jnp.array([[[0.0, 1.0, 0.5, 2.0]]])
+    got = diagnostics.of_critic(*(jnp.zeros((1, 1)) for _ in range(3)), quantiles, quantiles)
+    assert_allclose(got["critic/crossing"], 1 / 3)

@@ -1,0 +1,126 @@
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scipy.stats
+from numpy.testing import assert_allclose
+
+import dgae_jax as dg
+from dgae_jax.maths.transport import huber
+
+CVAR_HALF = jnp.array([2.0, 2.0, 0.0, 0.0])  # mean of the worse half
+
+
+def test_midpoints_of_four_quantiles_are_the_odd_eighths():
+    assert_allclose(dg.quantile_midpoints(4), [1 / 8, 3 / 8, 5 / 8, 7 / 8])
+
+
+def test_fewer_than_one_quantile_is_refused():
+    with pytest.raises(ValueError, match="at least 1"):
+        dg.quantile_midpoints(0)
+
+
+def test_directional_metric_is_the_difference_of_means_by_hand():
+    # ((3 - 0) + (5 - 1) + (1 - 2)) / 3 = 6 / 3
+    assert_allclose(dg.directional_metric(jnp.array([3.0, 5.0, 1.0]), jnp.array([0.0, 1.0, 2.0])), 2.0)
+
+
+def test_spectral_metric_weighs_sorted_quantiles_by_hand():
+    # sorted u = 1 2 3 4, sorted v = 0 0 1 1: (2·(1-0) + 2·(2-0)) / 4 = 1.5
+    u, v = jnp.array([4.0, 1.0, 3.0, 2.0]), jnp.array([0.0, 1.0, 0.0, 1.0])
+    assert_allclose(dg.directional_metric(u, v, CVAR_HALF), 1.5)
+
+
+@pytest.mark.parametrize("weights", [None, CVAR_HALF, jnp.array([0.4, 0.8, 1.2, 1.6])])
+def test_metric_is_antisymmetric_translation_and_scale_equivariant(weights, key):
+    u, v = jax.random.normal(key, (2, 7, 3, 4))
+    d = dg.directional_metric(u, v, weights)
+    assert d.shape == (7, 3)
+    assert_allclose(dg.directional_metric(v, u, weights), -d, atol=1e-6)
+    assert_allclose(dg.directional_metric(u + 5, v, weights), d + 5, atol=1e-5)
+    assert_allclose(dg.directional_metric(3 * u, 3 * v, weights), 3 * d, atol=1e-5)
+
+
+def test_metric_is_wasserstein_with_a_sign_where_one_distribution_dominates(key):
+    u = jax.random.normal(key, (5, 16))
+    v = u + jnp.arange(1.0, 17.0)
+    assert_allclose(dg.directional_metric(v, u), dg.wasserstein(v, u), rtol=1e-5)
+    assert_allclose(dg.directional_metric(u, v), -dg.wasserstein(v, u), rtol=1e-5)
+
+
+def test_similar_means_and_different_shapes_are_near_in_the_metric_and_far_in_wasserstein():
+    narrow, wide = jnp.array([-1.0, 1.0]), jnp.array([-10.0, 10.0])
+    assert_allclose(dg.directional_metric(wide, narrow), 0.0)
+    assert_allclose(dg.wasserstein(wide, narrow), 9.0)
+
+
+@pytest.mark.parametrize(
+    "weights", [jnp.array([1.0, 2.0]), jnp.array([3.0, -1.0]), jnp.ones((2, 2)), jnp.array([jnp.nan, 1.0]), jnp.array([0.0, 1.0])]
+)
+def test_weights_that_are_negative_or_do_not_integrate_to_one_are_refused(weights):
+    with pytest.raises(ValueError, match="of mean 1"):
+        dg.directional_metric(jnp.zeros(2), jnp.zeros(2), weights)
+
+
+def test_weights_may_be_traced():
+    u, v = jnp.array([4.0, 1.0, 3.0, 2.0]), jnp.zeros(4)
+    assert_allclose(jax.jit(dg.directional_metric)(u, v, CVAR_HALF), 1.5)
+
+
+@pytest.mark.parametrize("eta", [0.0, 0.5, 2.0])
+def test_lemma_inverse_cdf_of_a_non_negative_multiple_is_the_multiple(eta, key):
+    quantiles = jnp.sort(jax.random.normal(key, (9,)))
+    assert_allclose(jnp.sort(eta * quantiles), eta * quantiles)
+
+
+def test_lemma_needs_a_non_negative_multiple_because_a_negative_one_reverses_the_order():
+    quantiles = jnp.array([0.0, 1.0, 5.0])
+    assert_allclose(jnp.sort(-quantiles), -quantiles[::-1])
+    assert not jnp.allclose(jnp.sort(-quantiles), -quantiles)
+
+
+@pytest.mark.parametrize("p", [1.0, 2.0])
+def test_wasserstein_agrees_with_scipy(p, key):
+    u, v = np.asarray(jax.random.normal(key, (2, 11)))
+    order = scipy.stats.wasserstein_distance(u, v) if p == 1 else np.mean((np.sort(u) - np.sort(v)) ** 2) ** 0.5
+    assert_allclose(dg.wasserstein(jnp.asarray(u), jnp.asarray(v), p), order, rtol=1e-5)
+
+
+def test_wasserstein_of_order_below_one_is_refused():
+    with pytest.raises(ValueError, match="at least 1"):
+        dg.wasserstein(jnp.zeros(2), jnp.zeros(2), 0.5)
+
+
+def test_huber_is_quadratic_inside_and_linear_outside_by_hand():
+    # |u| ≤ 2: ½·1² = 0.5; beyond: 2·(5 - 1) = 8
+    assert_allclose(huber(jnp.array([1.0, -1.0, 5.0, -5.0]), 2.0), [0.5, 0.5, 8.0, 8.0])
+
+
+def test_gradient_of_huber_is_the_clipped_residual(key):
+    u = 3 * jax.random.normal(key, (50,))
+    assert_allclose(jax.vmap(jax.grad(huber), (0, None))(u, 1.0), jnp.clip(u, -1, 1), rtol=1e-6)
+
+
+def test_quantile_huber_loss_by_hand():
+    # K = 2, τ = 1/4, 3/4; z = 0, 1; target 2: u = 2, 1 → L₁ = 1.5, 0.5 → ¼·1.5 + ¾·0.5 = 0.75
+    # target -1: u = -1, -2 → L₁ = 0.5, 1.5 → ¾·0.5 + ¼·1.5 = 0.75
+    z = jnp.array([0.0, 1.0])
+    assert_allclose(dg.quantile_huber_loss(z, jnp.array([2.0])), 0.75)
+    assert_allclose(dg.quantile_huber_loss(z, jnp.array([-1.0])), 0.75)
+    # mean over targets, sum over predictions
+    assert_allclose(dg.quantile_huber_loss(z, jnp.array([2.0, -1.0])), 0.75)
+    assert_allclose(dg.quantile_huber_loss(z, jnp.array([0.0])), 0.25 * 0.5)
+
+
+def test_quantile_huber_of_one_quantile_is_half_the_huber_loss(key):
+    z, y = jax.random.normal(key, (2, 6, 1))
+    assert_allclose(dg.quantile_huber_loss(z, y, kappa=0.3), 0.5 * huber(y - z, 0.3)[:, 0], rtol=1e-6)
+
+
+@pytest.mark.parametrize("i", range(4))
+def test_quantile_huber_is_minimised_by_the_empirical_quantile(i, key):
+    # 101·τᵢ is no whole number for K = 4, so the empirical quantile is one of the samples, and no sample does better
+    samples = jax.random.normal(key, (101,))
+    losses = jax.vmap(lambda x: dg.quantile_huber_loss(jnp.zeros(4).at[i].set(x), samples, kappa=1e-3))(samples)
+    expected = np.quantile(np.asarray(samples), float(dg.quantile_midpoints(4)[i]), method="inverted_cdf")
+    assert_allclose(samples[losses.argmin()], expected)
