@@ -55,8 +55,8 @@ def ours(algo: str, physics: str, seconds: float) -> Row:
     while time.perf_counter() - since < seconds:
         state, _ = jax.block_until_ready(trainer.dispatch(config, state, 1))
         iterations += 1
-    speed = iterations * config.samples / (time.perf_counter() - since)
-    return Row(f"dgae_jax {algo}, {physics}, {config.num_envs} worlds", compiled - config.samples / speed, speed)
+    speed = iterations * config.samples_per_iteration / (time.perf_counter() - since)
+    return Row(f"dgae_jax {algo}, {physics}, {config.num_envs} worlds", compiled - config.samples_per_iteration / speed, speed)
 
 
 def peer(worlds: int, processes: bool, threads: int, seconds: float) -> Row:

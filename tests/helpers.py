@@ -1,5 +1,6 @@
 """What several test files share: a small configuration, the commands, files made by hand."""
 
+import dataclasses
 import hashlib
 import importlib
 import json
@@ -21,6 +22,14 @@ SMALL = dg.Config(
     policy=dg.PolicyConfig(hidden=(8,), epochs=2, minibatches=4),
     critic=dg.CriticConfig(hidden=(8,), epochs=2, minibatches=4, quantiles=8),
 )
+
+
+def small(algo, **changes):
+    """The small configuration of an algorithm, without the settings that it does not use."""
+    policy = dg.PolicyConfig(hidden=(8,)) if "trpo" in algo else SMALL.policy
+    critic = SMALL.critic if algo.startswith("d") else dataclasses.replace(SMALL.critic, quantiles=None)
+    return dataclasses.replace(SMALL, algo=algo, policy=policy, critic=critic, **changes)
+
 
 TINY = ["--physics", "native", "--num-envs", "4", "--horizon", "16", "--policy.minibatches", "4", "--critic.minibatches", "4",
         "--policy.hidden", "8", "--critic.hidden", "8"]  # fmt: skip

@@ -4,16 +4,16 @@ from typing import NamedTuple
 
 
 class Row(NamedTuple):
-    """What distinguishes one name from another; each part is a key of the table named here."""
+    """What distinguishes one name from another; each part is a key of a table in `configs.parts`."""
 
     critic: str
-    """`critics.CRITICS`: one value, or quantiles."""
+    """`CRITICS`: one value, or quantiles."""
     residual: str
-    """`critics.RESIDUALS`: the one thing DGAE changes."""
+    """`RESIDUALS`: the one thing DGAE changes."""
     target: str
-    """`critics.TARGETS`: what the critic is fitted to."""
-    update: str
-    """`updates.UPDATES`: how the policy moves."""
+    """`TARGETS`: what the critic is fitted to."""
+    policy_update: str
+    """`UPDATES`: how the policy improves."""
 
 
 TABLE = {

@@ -1,98 +1,110 @@
 """What a run is: every number that decides its result, with its unit and what is allowed.
 
-The dataclasses are pytrees whose floats and sample budget are leaves: they may be traced, so a sweep over them is one
-compiled program, and changing one does not compile again. Everything else is static.
+A setting that is None is unset: `resolve` fills in what the algorithm and the task take, and settings that the run's parts do not
+use stay None. Nothing here imports JAX, so that a command line is checked before it is loaded; `configs.pytree` makes the
+dataclasses pytrees.
 """
 
 import dataclasses
+from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
 from typing import Any
 
-import jax
-
 from dgae_jax.configs.algorithms import TABLE
+from dgae_jax.configs.parts import CRITICS, DESCENT, UPDATES
+from dgae_jax.envs.registry import EnvSpec, spec_of
 
 
 class ConfigError(ValueError):
-    """A setting that cannot be; the message names the flag, the value and what is allowed."""
+    """An invalid setting; the message names the setting, the value and what is allowed.
+
+    `setting` is the path of the setting that the message begins with, where there is one; a command line writes it as its flag.
+    """
+
+    def __init__(self, message: str, setting: str | None = None):
+        super().__init__(message)
+        self.setting = setting
 
 
-def _traced(*names: str):
-    """Register a dataclass as a pytree whose leaves are the fields `names` and nested configurations."""
+def invalid(setting: str, value: Any, allowed: str) -> ConfigError:
+    """The error that says what a setting must be."""
+    shown = " ".join(map(str, value)) if isinstance(value, tuple) else value
+    return ConfigError(f"{setting} {shown}: must be {allowed}", setting)
 
-    def register(cls):
-        rest = [f.name for f in fields(cls) if f.name not in names]
-        return jax.tree_util.register_dataclass(cls, data_fields=list(names), meta_fields=rest)
 
-    return register
+class _Settings:
+    """Values in the form that compiles once: whole numbers given for floats become floats, and lists tuples."""
+
+    def __post_init__(self):
+        for f in fields(self):  # pyright: ignore[reportArgumentType]
+            value = getattr(self, f.name)
+            if f.type in (float, float | None) and type(value) is int:
+                object.__setattr__(self, f.name, float(value))
+            if isinstance(value, list):
+                object.__setattr__(self, f.name, tuple(value))
 
 
 @dataclass(frozen=True)
-class FitConfig:
+class FitConfig(_Settings):
     """A network and the gradient steps on it."""
 
     hidden: tuple[int, ...] = (64, 64)
     """Width of each hidden layer [units]."""
-    optimizer: str = "adam"
+    optimizer: str | None = None
     """adam or rmsprop."""
-    learning_rate: float = 3e-4
+    learning_rate: float | None = None
     """Learning rate at the start [1]."""
-    learning_rate_end: float = 0.0
+    learning_rate_end: float | None = None
     """Learning rate at the end of the run as a fraction of its start: 1 constant, 0 linear decay to zero [1]."""
-    epochs: int = 10
+    epochs: int | None = None
     """Passes over each rollout [1]."""
-    minibatches: int = 32
+    minibatches: int | None = None
     """Gradient steps per pass; must divide num_envs * horizon [1]."""
-    max_grad_norm: float = 0.5
+    max_grad_norm: float | None = None
     """Largest global norm of a gradient [1]."""
 
 
-_FIT = ("learning_rate", "learning_rate_end", "max_grad_norm")
-
-
-@_traced(*_FIT, "clip", "initial_std", "radius", "damping")
 @dataclass(frozen=True)
 class PolicyConfig(FitConfig):
     """The policy network and how it improves."""
 
-    update: str = "default"
-    """clip (PPO), gradient (A2C) or trust-region (TRPO); default: the algorithm's own."""
+    update: str | None = None
+    """clip (PPO), gradient (A2C) or trust-region (TRPO); unset: the algorithm's own."""
     covariance: str = "shared"
-    """Where the actions' deviation comes from: shared (one learned vector) or state (an output of the network)."""
+    """Where the actions' standard deviation comes from: shared (one learned vector) or state (an output of the network)."""
     initial_std: float = 0.5
-    """Deviation of the first actions [units of the action]."""
-    clip: float = 0.2
+    """Standard deviation of the first actions [units of the action]."""
+    clip: float | None = None
     """PPO's clip range epsilon of the probability ratio [1]."""
-    radius: float = 0.01
-    """Trust region: largest mean KL divergence of a step [nats]."""
-    damping: float = 0.1
-    """Trust region: multiple of the identity added to the Fisher matrix [1]."""
-    cg_iterations: int = 10
+    radius: float | None = None
+    """Trust region: largest mean KL divergence of a step, summed over the action's dimensions [nats]."""
+    damping: float | None = None
+    """Trust region: multiple of the identity added to the Fisher matrix of the summed KL divergence [1]."""
+    cg_iterations: int | None = None
     """Trust region: iterations of conjugate gradient [1]."""
-    backtracks: int = 10
+    backtracks: int | None = None
     """Trust region: times a step is halved before it is given up [1]."""
-    fisher_every: int = 1
+    fisher_every: int | None = None
     """Trust region: the Fisher matrix is taken over every n-th sample [samples]."""
 
 
-@_traced(*_FIT, "kappa")
 @dataclass(frozen=True)
 class CriticConfig(FitConfig):
     """The value network and what it is fitted to."""
 
-    kind: str = "default"
-    """scalar (one value) or quantile (a distribution); default: the algorithm's own."""
-    target: str = "default"
-    """bellman, bellman-frozen, lambda-shift, sr-lambda or lambda-return; default: the algorithm's own."""
-    quantiles: int = 64
+    kind: str | None = None
+    """scalar (one value) or quantile (a distribution); unset: the algorithm's own."""
+    target: str | None = None
+    """bellman, bellman-frozen, lambda-shift, sr-lambda or lambda-return; unset: the algorithm's own."""
+    quantiles: int | None = None
     """Quantiles K of a distributional critic [1]."""
-    kappa: float = 1.0
+    kappa: float | None = None
     """Threshold of the quantile-Huber loss of a distributional critic [units of the scaled return]."""
 
 
 @dataclass(frozen=True)
-class NoiseConfig:
-    """Deviations of normal noise on the task, 0 for none; Gymnasium, the referee of evaluations, has none."""
+class NoiseConfig(_Settings):
+    """Standard deviations of normal noise on the task, 0 for none; Gymnasium, the referee of evaluations, has none."""
 
     reward: float = 0.0
     """On the reward [units of the reward]."""
@@ -104,23 +116,23 @@ class NoiseConfig:
     """On positions and velocities at a reset, beside the task's own [m, rad, and per second]."""
 
 
-@_traced("gamma", "lam", "total_steps", "policy", "critic")
 @dataclass(frozen=True)
-class Config:
+class Config(_Settings):
     """One training run."""
 
     env: str = "hopper"
     """Task: ant, hopper, swimmer, walker2d, or brax:NAME for one of Brax's own."""
-    env_version: str = "v4"
-    """Gymnasium version whose semantics the task has: v4 (the same as Gym's v3) or v5."""
-    algo: str = "dppo"
-    """Algorithm: ppo, trpo, a2c, or with a value distribution dppo, dtrpo, da2c."""
-    residual: str = "default"
-    """One-step residual of the advantage: td (of means) or distributional (by the metric); default: the algorithm's own."""
+    env_version: str | None = None
+    """Gymnasium version whose semantics the task has: v4 or v5; unset: v4, or none for one of Brax's own."""
+    algo: str | None = None
+    """Algorithm: ppo, trpo, a2c, or with a value distribution dppo, dtrpo, da2c; unset: dppo."""
+    residual: str | None = None
+    """One-step residual of the advantage: td (of means) or distributional (by the metric); unset: the algorithm's own."""
     metric: str = "mean"
     """Preference over value distributions: mean (the paper's), cvar:α, wang:β, power:c or mean-cvar:α:weight."""
-    physics: str = "jax"
-    """Engine that simulates the task: jax (our own stages, CPU or GPU) or native (C MuJoCo, CPU)."""
+    physics: str | None = None
+    """Engine that simulates the task: jax (our own stages, CPU or GPU), mjx (MuJoCo MJX), mjx-warp (its Warp variant) or native
+    (C MuJoCo, CPU); unset: jax, or mjx for one of Brax's own."""
     seed: int = 0
     """Seed of the first run; the others follow by one [1]."""
     num_seeds: int = 1
@@ -138,9 +150,9 @@ class Config:
     lam: float = 0.95
     """Lambda of GAE and of the critic's lambda targets, 0 to 1 [1]."""
     normalize_observations: bool = True
-    """Subtract the running mean of observations and divide by their deviation."""
+    """Subtract the running mean of observations and divide by their standard deviation."""
     normalize_rewards: bool = True
-    """Divide rewards by the running deviation of the discounted return."""
+    """Divide rewards by the running standard deviation of the discounted return."""
     diagnostics: bool = False
     """Calibration of the critic in the metrics of every iteration."""
     noise: NoiseConfig = field(default_factory=NoiseConfig)
@@ -148,82 +160,50 @@ class Config:
     critic: CriticConfig = field(default_factory=CriticConfig)
 
     @property
-    def samples(self) -> int:
+    def samples_per_iteration(self) -> int:
         """Samples per iteration and run."""
         return self.num_envs * self.horizon
 
     @property
     def iterations(self) -> int:
         """The largest whole number of iterations within the budget."""
-        return self.total_steps // self.samples
+        return self.total_steps // self.samples_per_iteration
 
 
 def resolve(config: Config) -> Config:
-    """The configuration with the algorithm's own parts written out."""
-    row = TABLE[config.algo]
+    """The configuration with everything unset that the run uses written out.
 
-    def chosen(value: str, own: str) -> str:
-        return own if value == "default" else value
-
-    policy, critic = config.policy, config.critic
-    return dataclasses.replace(
-        config,
-        residual=chosen(config.residual, row.residual),
-        policy=dataclasses.replace(policy, update=chosen(policy.update, row.update)),
-        critic=dataclasses.replace(critic, kind=chosen(critic.kind, row.critic), target=chosen(critic.target, row.target)),
-    )
-
-
-MAY_CHANGE = ("total_steps", "physics")
-"""What of a configuration may change between the parts of one run."""
+    Raises ConfigError for an unknown name of a task, an algorithm or a part.
+    """
+    spec, config = task_spec(config), _fill(config, {"algo": "dppo"})
+    row = lookup("algo", config.algo, TABLE)
+    version = spec.versions[0] if spec.versions else None
+    config = _fill(config, {"physics": spec.engines[0], "env_version": version, "residual": row.residual})
+    policy, critic = _fill(config.policy, {"update": row.policy_update}), _fill(config.critic, {"kind": row.critic, "target": row.target})
+    policy = _fill(policy, lookup("policy.update", policy.update, UPDATES).options)
+    critic = _fill(critic, {**DESCENT, **lookup("critic.kind", critic.kind, CRITICS).options})
+    return dataclasses.replace(config, policy=policy, critic=critic)
 
 
-def flag(path: str) -> str:
-    """The command-line spelling of a field."""
-    return "--" + path.replace("_", "-")
+def _fill(settings: Any, defaults: Mapping[str, Any]) -> Any:
+    return dataclasses.replace(settings, **{name: value for name, value in defaults.items() if getattr(settings, name) is None})
 
 
-def differences(one: Config, two: Config) -> dict[str, tuple[Any, Any]]:
-    """The fields, by path, in which two configurations differ, with both values."""
-
-    def flat(values: dict[str, Any], prefix: str = "") -> dict[str, Any]:
-        nested = (flat(v, f"{prefix}{k}.") if isinstance(v, dict) else {prefix + k: v} for k, v in values.items())
-        return {path: value for each in nested for path, value in each.items()}
-
-    ours, theirs = flat(to_dict(one)), flat(to_dict(two))
-    return {path: (value, theirs[path]) for path, value in ours.items() if value != theirs[path]}
+def lookup(setting: str, name: Any, table: Mapping[str, Any]) -> Any:
+    """The entry of a table; raises ConfigError, naming what exists, for a name that is not in it."""
+    if not isinstance(name, str) or name not in table:
+        raise invalid(setting, name, f"one of {', '.join(table)}")
+    return table[name]
 
 
-def to_dict(config: Config) -> dict[str, Any]:
-    """Plain data for JSON."""
-    return dataclasses.asdict(config)
+def task_spec(config: Config) -> EnvSpec:
+    """What exists of the configuration's task; raises ConfigError, naming the tasks, for an unknown one."""
+    try:
+        return spec_of(config.env)
+    except ValueError as allowed:
+        raise invalid("env", config.env, str(allowed)) from None
 
 
-def from_dict(data: dict[str, Any]) -> Config:
-    """The configuration written by `to_dict`; raises `ConfigError` for missing or unknown names and wrong types."""
-    return _from_dict(Config, data, "")
-
-
-def _from_dict(cls, data: Any, prefix: str):
-    if not isinstance(data, dict):
-        raise ConfigError(f"{prefix or 'configuration'}: must be an object, not {data!r}")
-    default = {f.name: getattr(cls(), f.name) for f in fields(cls)}
-    for name in sorted(set(data) ^ set(default)):
-        raise ConfigError(f"{prefix}{name}: {'unknown' if name in data else 'missing'}")
-    return cls(**{name: _value(data[name], like, prefix + name) for name, like in default.items()})
-
-
-def _value(value: Any, like: Any, path: str):
-    if dataclasses.is_dataclass(like):
-        return _from_dict(type(like), value, path + ".")
-    if isinstance(like, tuple):
-        ok = isinstance(value, list | tuple) and all(type(v) is int for v in value)
-        value = tuple(value) if ok else value
-    elif isinstance(like, float):
-        ok = type(value) is float or (type(value) is int and abs(value) < 2**53)
-        value = float(value) if ok else value
-    else:
-        ok = type(value) is type(like)
-    if not ok:
-        raise ConfigError(f"{path}: must be {type(like).__name__}, not {value!r}")
-    return value
+def flag(setting: str) -> str:
+    """The command-line spelling of a setting."""
+    return "--" + setting.replace("_", "-")

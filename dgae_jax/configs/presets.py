@@ -4,8 +4,8 @@ import dataclasses
 from typing import Any
 
 from dgae_jax.configs.algorithms import TABLE
-from dgae_jax.configs.config import Config, ConfigError
-from dgae_jax.learn.updates import UPDATES
+from dgae_jax.configs.config import Config, lookup
+from dgae_jax.configs.parts import CRITICS, UPDATES
 
 Settings = dict[str, Any]
 """Fields of `Config`, nested dictionaries for its parts."""
@@ -25,10 +25,11 @@ def _tuned(update: str, critic: str, env: str) -> list[Settings]:
 def _paper(update: str, critic: str, env: str) -> list[Settings]:
     ant = env == "ant"
     hidden, constant = (512, 512) if ant else (256, 256), {"learning_rate_end": 1.0}
+    quantile = {"quantiles": 64, "target": "bellman"} if critic == "quantile" else {"target": "lambda-return"}
     networks: Settings = {
         "total_steps": 10_000_000 if env in ("ant", "hopper") else 5_000_000,
         "policy": {"hidden": hidden, "covariance": "state", "initial_std": 1.0},
-        "critic": {"hidden": hidden, "quantiles": 64, "target": "bellman" if critic == "quantile" else "lambda-return", **constant},
+        "critic": {"hidden": hidden, **quantile, **constant},
     }
     once = {"optimizer": "rmsprop", "learning_rate": 7e-4, "epochs": 1, "minibatches": 1, **constant}
     by_update: dict[str, Settings] = {
@@ -50,17 +51,18 @@ def _paper(update: str, critic: str, env: str) -> list[Settings]:
 PRESETS = {"tuned": _tuned, "paper": _paper}
 
 
-def preset(name: str, algo: str, env: str, update: str = "default") -> Config:
-    """The configuration of a preset for an algorithm on a task; `update` takes the place of the algorithm's own.
+def preset(name: str, algo: str, env: str, update: str | None = None, critic: str | None = None) -> Config:
+    """The configuration of a preset for an algorithm on a task; `update` and `critic` take the place of the algorithm's own.
 
     Raises ConfigError for a name that does not exist.
     """
-    for flag, value, table in (("preset", name, PRESETS), ("algo", algo, TABLE), ("policy.update", update, ("default", *UPDATES))):
-        if value not in table:
-            raise ConfigError(f"--{flag} {value}: must be one of {', '.join(table)}")
-    row, config = TABLE[algo], Config(env=env, algo=algo)
-    for settings in PRESETS[name](row.update if update == "default" else update, row.critic, env):
-        config = _with(config, settings)
+    settings, row = lookup("preset", name, PRESETS), lookup("algo", algo, TABLE)
+    lookup("policy.update", update or row.policy_update, UPDATES)
+    lookup("critic.kind", critic or row.critic, CRITICS)
+    config = Config(env=env, algo=algo)
+    config = _with(config, {"policy": {"update": update}, "critic": {"kind": critic}})
+    for group in settings(update or row.policy_update, critic or row.critic, env):
+        config = _with(config, group)
     return config
 
 

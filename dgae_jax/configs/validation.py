@@ -1,128 +1,151 @@
-"""What a configuration may be: every setting alone, and all of them together."""
+"""What a configuration may be: every setting alone, and all of them together. Nothing here imports JAX.
+
+Values that are traced are not known yet and pass unchecked.
+"""
 
 import dataclasses
 import math
 from typing import Any
 
-import brax.envs
-
-from dgae_jax.configs.algorithms import TABLE
-from dgae_jax.configs.config import Config, ConfigError, PolicyConfig, flag, resolve
-from dgae_jax.envs.registry import BRAX, PHYSICS, TASKS, VERSIONS, make_env
-from dgae_jax.learn.critics import CRITICS, RESIDUALS, TARGETS
-from dgae_jax.learn.networks import COVARIANCES
-from dgae_jax.learn.updates import OPTIMIZERS, UPDATES
-from dgae_jax.maths.risk import weights_of
+from dgae_jax.configs.config import Config, ConfigError, invalid, lookup, resolve, task_spec
+from dgae_jax.configs.parts import COVARIANCES, CRITICS, OPTIMIZERS, RESIDUALS, TARGETS, UPDATES
+from dgae_jax.configs.serial import check_types
+from dgae_jax.maths.risk import check_metric
 
 LARGEST = 2**31 - 1
+"""What an int32, the largest index and counter of a device, can hold."""
 
-_PARTS = (("policy", "update", UPDATES), ("critic", "kind", CRITICS), ("critic", "target", TARGETS))
+WHOLE = {
+    "num_seeds": (1, 4096, "every one is a whole run in the same program"),
+    "total_steps": (1, LARGEST, "samples are counted in an int32"),
+    "num_envs": (1, LARGEST, "samples are indexed by an int32"),
+    "horizon": (1, LARGEST, "samples are indexed by an int32"),
+    "episode_length": (1, LARGEST, "steps are counted in an int32"),
+    "policy.epochs": (1, 10_000, "a pass more often over one rollout only fits its noise"),
+    "policy.minibatches": (1, LARGEST, "samples are indexed by an int32"),
+    "policy.cg_iterations": (1, 1000, "conjugate gradient has lost its orthogonality in float32 long before"),
+    "policy.backtracks": (0, 100, "a step halved more often is 0 in float32"),
+    "policy.fisher_every": (1, LARGEST, "samples are indexed by an int32"),
+    "critic.epochs": (1, 10_000, "a pass more often over one rollout only fits its noise"),
+    "critic.minibatches": (1, LARGEST, "samples are indexed by an int32"),
+    "critic.quantiles": (1, 10_000, "their residuals are K × K for every sample"),
+}
+"""Whole numbers: from, to, and why not more."""
 
+LAYERS, WIDTH = 32, 65_536
+"""Most hidden layers and units in one: XLA compiles each layer of every network by itself, for minutes from a hundred on."""
 
-def _check(path: str, value: Any, ok: bool, allowed: str) -> None:
-    if not ok:
-        shown = " ".join(map(str, value)) if isinstance(value, tuple) else value
-        raise ConfigError(f"{flag(path)} {shown}: must be {allowed}")
+UNIT = ("gamma", "lam", "policy.learning_rate_end", "critic.learning_rate_end")
+"""Numbers from 0 to 1."""
 
+POSITIVE = (
+    "policy.clip", "policy.initial_std", "policy.radius", "policy.damping", "policy.learning_rate", "policy.max_grad_norm",
+    "critic.learning_rate", "critic.max_grad_norm", "critic.kappa",
+)  # fmt: skip
+"""Numbers above 0."""
 
-def _choice(path: str, value: str, table: Any) -> None:
-    _check(path, value, value in table, f"one of {', '.join(table)}")
-
-
-def _positive(path: str, value: int) -> None:
-    _check(path, value, 1 <= value <= LARGEST, f"a whole number of at least 1 and at most {LARGEST:,}")
-
-
-def _between(path: str, value: float, low: float, high: float) -> None:
-    _check(path, value, low <= value <= high, f"a number from {low:g} to {high:g}")
-
-
-def _above_zero(path: str, value: float) -> None:
-    _check(path, value, 1e-30 <= value <= 1e30, "a number above 0, from 1e-30 to 1e30")
-
-
-def validate(config: Config) -> None:
-    """Raise `ConfigError` for the first setting that cannot be, alone or together with the others."""
-    if not config.env.startswith(BRAX):
-        _check("env", config.env, config.env in TASKS, f"one of {', '.join(TASKS)}, or {BRAX}NAME")
-    _choice("env_version", config.env_version, VERSIONS)
-    _choice("algo", config.algo, TABLE)
-    _choice("physics", config.physics, PHYSICS)
-    if config.env.startswith(BRAX):
-        _validate_brax(config)
-    for name in ("num_seeds", "total_steps", "num_envs", "horizon", "episode_length"):
-        _positive(name, getattr(config, name))
-    highest = 2**32 - config.num_seeds
-    _check("seed", config.seed, 0 <= config.seed <= highest, f"a whole number from 0 to {highest:,}")
-    _check("num_envs", config.num_envs, config.samples <= LARGEST, f"such that num_envs * horizon is at most {LARGEST:,}")
-    _between("gamma", config.gamma, 0, 1)
-    _between("lam", config.lam, 0, 1)
-    _choice("policy.covariance", config.policy.covariance, COVARIANCES)
-    _choice("residual", config.residual, ("default", *RESIDUALS))
-    for part, name, table in _PARTS:
-        _choice(f"{part}.{name}", getattr(getattr(config, part), name), ("default", *table))
-    _validate_policy(config.policy)
-    for name, deviation in dataclasses.asdict(config.noise).items():
-        _check(f"noise.{name}", deviation, deviation >= 0 and math.isfinite(deviation), "a finite number of at least 0")
-    _positive("critic.quantiles", config.critic.quantiles)
-    _above_zero("critic.kappa", config.critic.kappa)
-    for part in ("policy", "critic"):
-        _validate_fit(config, part)
-    _validate_use(config)
-    if config.iterations < 1:
-        _check("total_steps", config.total_steps, False, f"at least one iteration of num_envs * horizon = {config.samples:,} samples")
+CHOICES = {
+    "policy.covariance": COVARIANCES, "policy.optimizer": OPTIMIZERS, "critic.optimizer": OPTIMIZERS, "critic.target": TARGETS,
+    "residual": RESIDUALS,
+}  # fmt: skip
 
 
-def _validate_brax(config: Config) -> None:
-    name = config.env.removeprefix(BRAX)
-    known = name in brax.envs._envs and not name.startswith("dgae_")
-    _check("env", config.env, known, f"one of {', '.join(TASKS)}, or {BRAX}NAME with a name that brax.envs knows")
-    try:
-        make_env(config.env)
-    except (ValueError, TypeError) as reason:
-        _check("env", config.env, False, f"an environment that Brax can build on jax ({reason})")
-    _check("physics", config.physics, config.physics == "jax", f"mjx with an environment of Brax's own ({config.env})")
-    _check("env_version", config.env_version, config.env_version == Config.env_version, "left out with an environment of Brax's own")
-    _check("noise.initial", config.noise.initial, config.noise.initial == 0, "left out with an environment of Brax's own")
+def validate(config: Config) -> Config:
+    """The configuration resolved, with everything unset that the run uses written out.
 
-
-def _validate_policy(settings: PolicyConfig) -> None:
-    for name in ("clip", "initial_std", "radius", "damping"):
-        _above_zero(f"policy.{name}", getattr(settings, name))
-    for name in ("cg_iterations", "fisher_every"):
-        _positive(f"policy.{name}", getattr(settings, name))
-    _check("policy.backtracks", settings.backtracks, settings.backtracks >= 0, "a whole number of at least 0")
-
-
-def _validate_fit(config: Config, part: str) -> None:
-    settings = getattr(config, part)
-    _check(f"{part}.hidden", settings.hidden, len(settings.hidden) >= 1 and min(settings.hidden) >= 1, "one or more widths of at least 1")
-    _choice(f"{part}.optimizer", settings.optimizer, OPTIMIZERS)
-    _above_zero(f"{part}.learning_rate", settings.learning_rate)
-    _between(f"{part}.learning_rate_end", settings.learning_rate_end, 0, 1)
-    _above_zero(f"{part}.max_grad_norm", settings.max_grad_norm)
-    _positive(f"{part}.epochs", settings.epochs)
-    _positive(f"{part}.minibatches", settings.minibatches)
-    if part == "critic" or "minibatches" in UPDATES[resolve(config).policy.update].options:
-        divides = config.samples % settings.minibatches == 0
-        _check(f"{part}.minibatches", settings.minibatches, divides, f"a divisor of num_envs * horizon = {config.samples:,}")
-
-
-def _validate_use(config: Config) -> None:
-    """No setting that the parts of this run have no use for."""
+    Raises ConfigError for the first setting that is invalid, alone or together with the others.
+    """
+    check_types(config)
     full = resolve(config)
+    _check_task(full)
+    _check_each(full)
+    _check_networks(full)
+    _check_use(full)
+    _check_samples(full)
+    return full
+
+
+def _check(setting: str, value: Any, ok: bool, allowed: str) -> None:
+    if not ok:
+        raise invalid(setting, value, allowed)
+
+
+def _get(config: Config, path: str) -> Any:
+    """The value of a setting; None where it is unset or traced."""
+    value: Any = config
+    for name in path.split("."):
+        value = getattr(value, name)
+    return value if isinstance(value, int | float | str | tuple) else None
+
+
+def _check_task(config: Config) -> None:
+    spec = task_spec(config)
+    lookup("physics", config.physics, dict.fromkeys(spec.engines))
+    if spec.versions:
+        lookup("env_version", config.env_version, dict.fromkeys(spec.versions))
+    else:
+        _check("env_version", config.env_version, config.env_version is None, f"left out with {config.env}")
+        _check("noise.initial", config.noise.initial, config.noise.initial == 0, f"left out with {config.env}")
+    for name, std in dataclasses.asdict(config.noise).items():
+        _check(f"noise.{name}", std, std >= 0 and math.isfinite(std), "a finite number of at least 0")
+
+
+def _check_each(config: Config) -> None:
+    for path, (low, high, reason) in WHOLE.items():
+        if (value := _get(config, path)) is not None:
+            _check(path, value, low <= value <= high, f"a whole number from {low:,} to {high:,} ({reason})")
+    for path in UNIT:
+        if (value := _get(config, path)) is not None:
+            _check(path, value, 0 <= value <= 1, "a number from 0 to 1")
+    for path in POSITIVE:
+        if (value := _get(config, path)) is not None:
+            _check(path, value, 1e-30 <= value <= 1e30, "a number above 0, from 1e-30 to 1e30")
+    for path, table in CHOICES.items():
+        if (value := _get(config, path)) is not None:
+            lookup(path, value, table)
+    highest = 2**32 - config.num_seeds
+    _check("seed", config.seed, 0 <= config.seed <= highest, f"a whole number from 0 to {highest:,} (seeds are numbers of 32 bits)")
+
+
+def _check_networks(config: Config) -> None:
+    for path in ("policy.hidden", "critic.hidden"):
+        hidden = _get(config, path)
+        _check(path, hidden, len(hidden) >= 1 and min(hidden) >= 1, "one or more widths of at least 1")
+        _check(path, hidden, max(hidden) <= WIDTH, f"widths of at most {WIDTH:,} (one layer of them has 17 GB of weights)")
+        if len(hidden) > LAYERS:
+            raise ConfigError(
+                f"{path} of {len(hidden):,} layers: must be at most {LAYERS} (XLA compiles a thousand for half an hour)", path
+            )
+
+
+def _check_use(config: Config) -> None:
+    """No setting that the parts of this run do not use."""
     for part, group, chosen, table in (
-        ("policy", config.policy, full.policy.update, UPDATES),
-        ("critic", config.critic, full.critic.kind, CRITICS),
+        ("policy", config.policy, config.policy.update, UPDATES),
+        ("critic", config.critic, config.critic.kind, CRITICS),
     ):
-        for name in sorted({option for each in table.values() for option in each.options} - set(table[chosen].options)):
-            value, default = getattr(group, name), getattr(type(group)(), name)
-            _check(f"{part}.{name}", value, value == default, f"left out: {config.algo} with {chosen} does not use it")
+        unused = {option for each in table.values() for option in each.options} - set(table[chosen].options)
+        for name in sorted(unused):
+            value = getattr(group, name)
+            _check(f"{part}.{name}", value, value is None, f"left out: {config.algo} with {chosen} does not use it")
     try:
-        weights_of(config.metric, full.critic.quantiles)
+        check_metric(config.metric)
     except ValueError as allowed:
-        _check("metric", config.metric, False, str(allowed))
-    calibrated = not config.diagnostics or full.critic.kind == "quantile"
-    _check("diagnostics", config.diagnostics, calibrated, f"left out: the critic of {config.algo} is no distribution")
-    used = config.metric == "mean" or (full.residual == "distributional" and full.critic.kind == "quantile")
-    _check("metric", config.metric, used, "mean, or used with a distributional residual and a quantile critic")
+        raise invalid("metric", config.metric, str(allowed)) from None
+    distribution = config.critic.kind == "quantile"
+    _check("diagnostics", config.diagnostics, distribution or not config.diagnostics, f"left out: the critic of {config.algo} is scalar")
+    used = config.metric == "mean" or (config.residual == "distributional" and distribution)
+    _check("metric", config.metric, used, f"mean with {config.algo}: other metrics need a distributional residual and a quantile critic")
+
+
+def _check_samples(config: Config) -> None:
+    samples = config.samples_per_iteration
+    _check("num_envs", config.num_envs, samples <= LARGEST, f"such that num_envs * horizon is at most {LARGEST:,}")
+    for path in ("policy.minibatches", "critic.minibatches"):
+        if (minibatches := _get(config, path)) is not None:
+            _check(path, minibatches, samples % minibatches == 0, f"a divisor of num_envs * horizon = {samples:,}")
+    if (every := _get(config, "policy.fisher_every")) is not None:
+        _check("policy.fisher_every", every, every <= samples, f"at most num_envs * horizon = {samples:,}")
+    if _get(config, "total_steps") is not None:
+        enough = config.total_steps >= samples
+        _check("total_steps", config.total_steps, enough, f"at least one iteration of num_envs * horizon = {samples:,} samples")

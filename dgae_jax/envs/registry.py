@@ -2,6 +2,7 @@
 
 import warnings
 from functools import partial
+from typing import NamedTuple
 
 import brax.envs
 import jax.numpy as jnp
@@ -21,6 +22,22 @@ BRAX = "brax:"
 """Before the name of an environment of Brax's own."""
 
 
+class EnvSpec(NamedTuple):
+    """What exists of a task."""
+
+    engines: tuple[str, ...]
+    versions: tuple[str, ...]
+
+
+def spec_of(name: str) -> EnvSpec:
+    """What exists of the task `name`; raises ValueError, saying what is allowed, for an unknown one."""
+    if name.startswith(BRAX) and name.removeprefix(BRAX) in brax.envs._envs and not name.startswith(BRAX + "dgae_"):
+        return EnvSpec(("mjx",), ())
+    if name not in TASKS:
+        raise ValueError(f"one of {', '.join(TASKS)}, or {BRAX}NAME with a name that brax.envs knows")
+    return EnvSpec(("jax", "native"), VERSIONS)
+
+
 class BraxTask(Wrapper):
     """An environment of Brax's own, whose actions lie in [−1, 1]."""
 
@@ -30,7 +47,7 @@ class BraxTask(Wrapper):
         return -jnp.ones(self.action_size), jnp.ones(self.action_size)
 
 
-def make_env(name: str, *, physics: str = "jax", version: str = "v4", **task_parameters) -> Env:
+def make_env(name: str, *, physics: str | None = "jax", version: str | None = "v4", **task_parameters) -> Env:
     """The task `name` over the physics `physics`, with Gymnasium's semantics of `version` (v4 is Gym's v3).
 
     `task_parameters` are those of Gymnasium's constructor. `brax:NAME` is an environment of Brax's own, on `mjx`; its

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
 from dgae_jax.learn.networks import value_network
-from dgae_jax.learn.types import Batch, Critic, Params, Part
+from dgae_jax.learn.types import Batch, Critic, Params
 from dgae_jax.maths.returns import (
     bellman_target,
     distributional_td_residual,
@@ -23,45 +23,51 @@ from dgae_jax.maths.transport import quantile_huber_loss
 class Target(NamedTuple):
     """What a critic is fitted to."""
 
-    frozen: Callable
-    """`frozen(key, reward, discount, trace, quantiles, next_quantiles)`, once per iteration."""
-    during: Callable
-    """`during(predict, params, batch)`, at every gradient step."""
+    compute: Callable
+    """`compute(key, reward, discount, trace, quantiles, next_quantiles) -> [T, N, J]`, one signature for all."""
+    recompute: bool = False
+    """Whether it is computed anew at every gradient step, with the critic as it is then, or once per iteration."""
 
 
-def _keep(predict, params: Params, batch: Batch) -> Array:
-    return batch.target
-
-
-def _follow(predict, params: Params, batch: Batch) -> Array:
-    """𝒯G with the critic as it is now, through which no gradient flows."""
-    return bellman_target(batch.reward, batch.discount, jax.lax.stop_gradient(predict(params, batch.next_obs)))
-
-
-def _one_step(key, reward, discount, trace, quantiles, next_quantiles):
+def _bellman(key, reward, discount, trace, quantiles, next_quantiles):
     return bellman_target(reward, discount, next_quantiles)
 
 
-TARGETS = {
-    "bellman": Target(_one_step, _follow),
-    "bellman-frozen": Target(_one_step, _keep),
-    "lambda-shift": Target(lambda key, *step: lambda_shift_target(*step), _keep),
-    "sr-lambda": Target(lambda key, r, d, t, z, z_next: sr_lambda_target(key, r, d, t, z_next), _keep),
-    "lambda-return": Target(lambda key, *step: lambda_return(*step), _keep),
-}
+def _lambda_shift(key, reward, discount, trace, quantiles, next_quantiles):
+    return lambda_shift_target(reward, discount, trace, quantiles, next_quantiles)
 
 
-def _critic(obs_size: int, outputs: int, hidden: Sequence[int], target: str, distance: Callable) -> Critic:
-    network, fitted_to = value_network(obs_size, outputs, hidden=hidden), TARGETS[target]
+def _sr_lambda(key, reward, discount, trace, quantiles, next_quantiles):
+    return sr_lambda_target(key, reward, discount, trace, next_quantiles)
+
+
+def _lambda_return(key, reward, discount, trace, quantiles, next_quantiles):
+    return lambda_return(reward, discount, trace, quantiles, next_quantiles)[..., None]
+
+
+BELLMAN = Target(_bellman, recompute=True)
+BELLMAN_FROZEN = Target(_bellman)
+LAMBDA_SHIFT = Target(_lambda_shift)
+SR_LAMBDA = Target(_sr_lambda)
+LAMBDA_RETURN = Target(_lambda_return)
+
+
+def _critic(obs_size: int, outputs: int, hidden: Sequence[int], target: Target, distance: Callable) -> Critic:
+    network = value_network(obs_size, outputs, hidden=hidden)
+
+    def fitted_to(params: Params, batch: Batch) -> Array:
+        if not target.recompute:
+            return batch.target
+        following = jax.lax.stop_gradient(network.apply(params, batch.next_obs))
+        return target.compute(None, batch.reward, batch.discount, None, None, following)
 
     def loss(params: Params, batch: Batch):
-        target = fitted_to.during(network.apply, params, batch)
-        return jnp.where(batch.sound, distance(network.apply(params, batch.obs), target), 0).mean(), {}
+        return jnp.where(batch.sound, distance(network.apply(params, batch.obs), fitted_to(params, batch)), 0).mean(), {}
 
-    return Critic(network.init, network.apply, fitted_to.frozen, loss)
+    return Critic(network.init, network.apply, target.compute, loss)
 
 
-def scalar(obs_size: int, *, hidden: Sequence[int], target: str) -> Critic:
+def scalar(obs_size: int, *, hidden: Sequence[int], target: Target) -> Critic:
     """V(s), fitted by half the squared error."""
 
     def distance(value: Float[Array, "B 1"], target: Float[Array, "B 1"]) -> Float[Array, " B"]:
@@ -70,7 +76,7 @@ def scalar(obs_size: int, *, hidden: Sequence[int], target: str) -> Critic:
     return _critic(obs_size, 1, hidden, target, distance)
 
 
-def quantile(obs_size: int, *, hidden: Sequence[int], target: str, quantiles: int, kappa: ArrayLike) -> Critic:
+def quantile(obs_size: int, *, hidden: Sequence[int], target: Target, quantiles: int, kappa: ArrayLike) -> Critic:
     """F⁻¹ of the return at K midpoints, fitted by the quantile-Huber loss (Eq. quantile_huber_loss)."""
 
     def distance(quantiles: Float[Array, "B K"], target: Float[Array, "B J"]) -> Float[Array, " B"]:
@@ -79,17 +85,11 @@ def quantile(obs_size: int, *, hidden: Sequence[int], target: str, quantiles: in
     return _critic(obs_size, quantiles, hidden, target, distance)
 
 
-CRITICS = {"scalar": Part(scalar), "quantile": Part(quantile, ("quantiles", "kappa"))}
-"""What a critic predicts: `build(obs_size, hidden=, target=, **options) -> Critic`."""
-
-
-def _of_means(weights):
+def td(weights: ArrayLike | None) -> Callable[..., Array]:
+    """The scalar residual, of the means (below Eq. GAE); no metric."""
     return lambda reward, discount, z, z_next: td_residual(reward, discount, z.mean(-1), z_next.mean(-1))
 
 
-def _of_distributions(weights):
+def distributional(weights: ArrayLike | None) -> Callable[..., Array]:
+    """The distributional residual under the metric of these weights (Def. distributional_TD_error)."""
     return lambda reward, discount, z, z_next: distributional_td_residual(reward, discount, z, z_next, weights)
-
-
-RESIDUALS = {"td": Part(_of_means), "distributional": Part(_of_distributions, ("metric",))}
-"""How two predictions become one number: `build(weights of the metric) -> residual(reward, discount, z, z_next)`."""

@@ -33,7 +33,7 @@ def of_critic(
     `going` is 1 where the episode goes on. `similar_means` is the share of steps whose target and prediction have similar
     means and different shapes, |d(r + γG′, G)| ≤ 0.1 W₁(r + γG′, G) (Sec. results).
     """
-    outcome = lambda_return(reward, discount, going, quantiles, next_quantiles)[..., 0]
+    outcome = lambda_return(reward, discount, going, quantiles, next_quantiles)
     probability, target = pit(quantiles, outcome), bellman_target(reward, discount, next_quantiles)
     similar = jnp.abs(directional_metric(target, quantiles)) <= SIMILAR * wasserstein(target, quantiles)
     return {

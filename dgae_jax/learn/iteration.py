@@ -41,8 +41,8 @@ def make_train(
         policy_key, critic_key, env_key, key = jax.random.split(key, 4)
         policy, critic = algorithm.policy.init(policy_key), algorithm.critic.init(critic_key)
         return TrainState(
-            policy=Fit(policy, algorithm.improve.init(policy)),
-            critic=Fit(critic, algorithm.evaluate.init(critic)),
+            policy=Fit(policy, algorithm.policy_update.init(policy)),
+            critic=Fit(critic, algorithm.critic_update.init(critic)),
             observations=normalizers.observations(int(env.observation_size)),  # pyright: ignore[reportArgumentType]
             returns=normalizers.return_scale(num_envs),
             episodes=start(env, env_key, num_envs),
@@ -60,8 +60,8 @@ def make_train(
             done = (step.terminated | step.truncated).astype(reward.dtype)
             returns, reward = normalizers.rescale(returns, reward, done, gamma)
         batch, estimates = _estimate(algorithm, state, step, reward, target_key, gamma, lam, diagnose)
-        policy, improved = algorithm.improve.step(policy_key, state.policy, batch)
-        critic, evaluated = algorithm.evaluate.step(critic_key, state.critic, batch)
+        policy, improved = algorithm.policy_update.step(policy_key, state.policy, batch)
+        critic, evaluated = algorithm.critic_update.step(critic_key, state.critic, batch)
         sound = _finite((policy, critic, improved["loss"], evaluated["loss"]))
         policy, critic = jax.tree.map(lambda new, old: jnp.where(sound, new, old), (policy, critic), (state.policy, state.critic))
         observations = normalizers.observe(state.observations, step.obs, step.sound) if normalize_observations else state.observations
@@ -119,7 +119,7 @@ def _estimate(
     going = 1.0 - (step.terminated | step.truncated)
     metrics = {
         "critic/value": value.mean(),
-        "critic/explained_variance": explained_variance(value, lambda_return(reward, discount, trace, quantiles, next_quantiles)[..., 0]),
+        "critic/explained_variance": explained_variance(value, lambda_return(reward, discount, trace, quantiles, next_quantiles)),
         **diagnose(reward, discount, going, quantiles, next_quantiles),
     }
     return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), batch), metrics

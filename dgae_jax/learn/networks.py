@@ -78,12 +78,11 @@ class StateCovariance(nn.Module):
         return Gaussian(mean, jnp.clip(log_std, -5.0, 2.0))
 
 
-COVARIANCES = {"shared": SharedCovariance, "state": StateCovariance}
-
-
-def gaussian_policy(obs_size: int, action_size: int, *, hidden: Sequence[int], covariance: str, initial_std: ArrayLike) -> Policy:
-    """A Gaussian policy with mean and diagonal covariance (Sec. results, set-up)."""
-    module = COVARIANCES[covariance](tuple(hidden), action_size, initial_std)
+def gaussian_policy(
+    obs_size: int, action_size: int, *, hidden: Sequence[int], covariance: Callable[..., nn.Module], initial_std: ArrayLike
+) -> Policy:
+    """A Gaussian policy with mean and diagonal covariance (Sec. results, set-up); `covariance` is one of the modules above."""
+    module = covariance(tuple(hidden), action_size, initial_std)
     return Policy(lambda key: module.init(key, jnp.zeros(obs_size)), module.apply)
 
 

@@ -102,15 +102,5 @@ class Algorithm(NamedTuple):
     critic: Critic
     residual: Callable
     """`residual(reward, discount, quantiles, next_quantiles) -> δ`, the one thing DGAE changes."""
-    improve: Update
-    """The policy step."""
-    evaluate: Update
-    """The critic fit."""
-
-
-class Part(NamedTuple):
-    """An entry of a table of parts."""
-
-    build: Callable
-    options: tuple[str, ...] = ()
-    """The settings it is built with; it has no use for any other of its group."""
+    policy_update: Update
+    critic_update: Update

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import optax
 from jaxtyping import Array, ArrayLike
 
-from dgae_jax.learn.types import Batch, Fit, Params, Part, Policy, Update
+from dgae_jax.learn.types import Batch, Fit, Params, Policy, Update
 from dgae_jax.maths import gaussian
 
 Loss = Callable[[Params, Batch], tuple[jax.Array, dict[str, jax.Array]]]
@@ -124,13 +124,17 @@ def fisher_product(policy: Policy, params: Params, obs: Array, damping: ArrayLik
     return product
 
 
-OPTIMIZERS = {
-    "adam": lambda rate: optax.adam(rate, eps=1e-5),  # ε as in the implementations of PPO (Andrychowicz et al. 2021)
-    "rmsprop": lambda rate: optax.rmsprop(rate, decay=0.99, eps=1e-5, eps_in_sqrt=False),  # as stable-baselines3
-}
+def adam(rate) -> optax.GradientTransformation:
+    """Adam with the ε of the implementations of PPO (Andrychowicz et al. 2021)."""
+    return optax.adam(rate, eps=1e-5)
 
 
-def descent(name: str, learning_rate, *, final_fraction, gradient_steps, max_norm) -> optax.GradientTransformation:
+def rmsprop(rate) -> optax.GradientTransformation:
+    """RMSProp as in stable-baselines3's A2C."""
+    return optax.rmsprop(rate, decay=0.99, eps=1e-5, eps_in_sqrt=False)
+
+
+def descent(optimizer: Callable, learning_rate, *, final_fraction, gradient_steps, max_norm) -> optax.GradientTransformation:
     """An optimizer behind a global-norm clip, its rate falling linearly to `final_fraction` of its start over `gradient_steps`.
 
     All four numbers may be traced.
@@ -140,7 +144,7 @@ def descent(name: str, learning_rate, *, final_fraction, gradient_steps, max_nor
         done = jnp.minimum(jnp.divide(count, gradient_steps), 1.0)
         return learning_rate * (1 + (final_fraction - 1) * done)
 
-    return optax.chain(optax.clip_by_global_norm(max_norm), OPTIMIZERS[name](schedule))
+    return optax.chain(optax.clip_by_global_norm(max_norm), optimizer(schedule))
 
 
 def descend(
@@ -152,14 +156,16 @@ def descend(
     return sgd(loss, rule, epochs=epochs, minibatches=minibatches)
 
 
-DESCENT = ("optimizer", "learning_rate", "learning_rate_end", "epochs", "minibatches", "max_grad_norm")
+def clipped(policy: Policy, iterations: ArrayLike, *, clip: ArrayLike, **fit) -> Update:
+    """PPO: descent on the clipped surrogate."""
+    return descend(surrogate(policy, clip), iterations, **fit)
 
-UPDATES = {
-    "clip": Part(lambda policy, n, *, clip, **fit: descend(surrogate(policy, clip), n, **fit), ("clip", *DESCENT)),
-    "gradient": Part(lambda policy, n, **fit: descend(surrogate(policy), n, **fit), DESCENT),
-    "trust-region": Part(
-        lambda policy, n, **search: trust_region(policy, surrogate(policy), **search),
-        ("radius", "damping", "cg_iterations", "backtracks", "fisher_every"),
-    ),
-}
-"""How a policy improves: `build(policy, iterations, **options) -> Update`."""
+
+def policy_gradient(policy: Policy, iterations: ArrayLike, **fit) -> Update:
+    """A2C: descent on the surrogate without a clip."""
+    return descend(surrogate(policy), iterations, **fit)
+
+
+def natural_gradient(policy: Policy, iterations: ArrayLike, **search) -> Update:
+    """TRPO: the surrogate's step within a trust region."""
+    return trust_region(policy, surrogate(policy), **search)

@@ -118,7 +118,7 @@ def n_step_advantage(
     return directional_metric(reward[..., None] + discount * successor, quantiles, weights)
 
 
-# ---- what a critic is fitted to: five targets [T, ..., J], from predictions of the critic that acted ----
+# ---- what a critic is fitted to: five targets, from predictions of the critic that acted ----
 
 
 def bellman_target(
@@ -134,11 +134,11 @@ def lambda_return(
     trace: Float[Array, "T *batch"],
     quantiles: Float[Array, "T *batch K"],
     next_quantiles: Float[Array, "T *batch K"],
-) -> Float[Array, "T *batch 1"]:
-    """The scalar λ-return G^λ = V + Â_GAE, with V the mean of the quantiles: one atom for all of them."""
+) -> Float[Array, "T *batch"]:
+    """The λ-return G^λ = V + Â_GAE, with V the mean of the quantiles (Schulman et al. 2016)."""
     value = quantiles.mean(-1)
     delta = td_residual(reward, discount, value, next_quantiles.mean(-1))
-    return (value + lambda_sum(delta, discount * trace))[..., None]
+    return value + lambda_sum(delta, discount * trace)
 
 
 def lambda_shift_target(
@@ -151,7 +151,7 @@ def lambda_shift_target(
     """The one-step target's shape, moved to the λ-return's mean: 𝒯G − E[𝒯G] + G^λ."""
     one_step = bellman_target(reward, discount, next_quantiles)
     mean = lambda_return(reward, discount, trace, quantiles, next_quantiles)
-    return one_step - one_step.mean(-1, keepdims=True) + mean
+    return one_step - one_step.mean(-1, keepdims=True) + mean[..., None]
 
 
 def sr_lambda_target(

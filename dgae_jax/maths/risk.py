@@ -5,13 +5,21 @@ K equal cells, times K. Their mean is D(1) = 1, so that the directional metric s
 """
 
 from collections.abc import Callable
+from statistics import NormalDist
 from typing import NamedTuple
 
-import jax.numpy as jnp
-from jax.scipy.stats import norm
-from jaxtyping import Array, Float
+import numpy as np
+from jaxtyping import Float
+from numpy.typing import ArrayLike
 
-from dgae_jax.maths.transport import spectral_weights
+
+def check_spectral(weights: ArrayLike) -> np.ndarray:
+    """The weights [K] as they are; raises ValueError unless w ≥ 0 and ∫ w(q) dq = 1, that is mean(w) = 1 over the midpoints."""
+    w = np.asarray(weights, np.float64)
+    if w.ndim != 1 or (w < 0).any() or not abs(w.mean() - 1) < 1e-5:
+        found = f"shape {w.shape}, minimum {w.min():g}, mean {w.mean():g}"
+        raise ValueError(f"spectral weights must be a vector, non-negative and of mean 1; got {found}")
+    return w
 
 
 class Metric(NamedTuple):
@@ -20,36 +28,38 @@ class Metric(NamedTuple):
     parameters: tuple[str, ...]
     allowed: Callable[..., bool]
     limits: str
-    weights: Callable[..., Array]
+    weights: Callable[..., ArrayLike]
     """`weights(K, *parameters) -> [K]`, non-negative and of mean 1."""
 
 
-def _cells(distortion: Callable[[Array], Array]) -> Callable[[int], Array]:
-    return lambda k: k * jnp.diff(distortion(jnp.linspace(0.0, 1.0, k + 1)))
+def _cells(distortion: Callable[[float], float], k: int) -> Float[np.ndarray, " K"]:
+    inner = [distortion(i / k) for i in range(1, k)]
+    return k * np.diff([0.0, *inner, 1.0])
 
 
-def cvar(k: int, alpha: float) -> Float[Array, " K"]:
+def cvar(k: int, alpha: float) -> Float[np.ndarray, " K"]:
     """Conditional value at risk: the mean of the worst share α (Rockafellar & Uryasev 2000)."""
-    return _cells(lambda q: jnp.minimum(q / alpha, 1))(k)
+    return _cells(lambda q: min(q / alpha, 1.0), k)
 
 
-def wang(k: int, beta: float) -> Float[Array, " K"]:
+def wang(k: int, beta: float) -> Float[np.ndarray, " K"]:
     """D(q) = Φ(Φ⁻¹(q) + β): averse to risk for β > 0 (Wang 2000)."""
-    return _cells(lambda q: norm.cdf(norm.ppf(q) + beta))(k)
+    normal = NormalDist()
+    return _cells(lambda q: normal.cdf(normal.inv_cdf(q) + beta), k)
 
 
-def power(k: int, c: float) -> Float[Array, " K"]:
+def power(k: int, c: float) -> Float[np.ndarray, " K"]:
     """D(q) = 1 − (1 − q)ᶜ: for a whole c the expected minimum of c draws; seeking risk for c < 1 (proportional hazard)."""
-    return _cells(lambda q: 1 - (1 - q) ** c)(k)
+    return _cells(lambda q: 1 - (1 - q) ** c, k)
 
 
-def mean_cvar(k: int, alpha: float, weight: float) -> Float[Array, " K"]:
+def mean_cvar(k: int, alpha: float, weight: float) -> Float[np.ndarray, " K"]:
     """`weight` parts of CVaR and the rest the mean."""
-    return weight * cvar(k, alpha) + (1 - weight) * jnp.ones(k)
+    return weight * cvar(k, alpha) + (1 - weight)
 
 
 METRICS = {
-    "mean": Metric((), lambda: True, "", lambda k: jnp.ones(k)),
+    "mean": Metric((), lambda: True, "", np.ones),
     "cvar": Metric(("α",), lambda a: 1e-6 <= a <= 1, "1e-6 ≤ α ≤ 1", cvar),
     "wang": Metric(("β",), lambda b: abs(b) <= 5, "−5 ≤ β ≤ 5", wang),
     "power": Metric(("c",), lambda c: 1e-3 <= c <= 1e3, "1e-3 ≤ c ≤ 1e3", power),
@@ -63,14 +73,25 @@ def forms() -> str:
     return ", ".join(":".join((name, *metric.parameters)) for name, metric in METRICS.items())
 
 
-def weights_of(metric: str, k: int) -> Float[Array, " K"] | None:
+def weights_of(metric: str, k: int) -> Float[np.ndarray, " K"] | None:
     """The weights that `NAME:PARAMETER:…` asks for over K quantiles; None for the mean, the paper's metric.
 
     Raises ValueError, saying what is allowed, for anything else, and for weights that are negative or not of mean 1.
     """
-    name, *rest = metric.split(":")
     if metric == "mean":
         return None
+    family, parameters = _parsed(metric)
+    return check_spectral(family.weights(k, *parameters))
+
+
+def check_metric(metric: str) -> None:
+    """Raise ValueError, saying what is allowed, for a metric that does not exist or parameters out of range."""
+    if metric != "mean":
+        _parsed(metric)
+
+
+def _parsed(metric: str) -> tuple[Metric, list[float]]:
+    name, *rest = metric.split(":")
     if name not in METRICS or len(rest) != len(METRICS[name].parameters):
         raise ValueError(f"one of {forms()}")
     family = METRICS[name]
@@ -80,4 +101,4 @@ def weights_of(metric: str, k: int) -> Float[Array, " K"] | None:
         raise ValueError(f"{':'.join((name, *family.parameters))} with numbers") from None
     if not family.allowed(*parameters):
         raise ValueError(f"{':'.join((name, *family.parameters))} with {family.limits}")
-    return spectral_weights(family.weights(k, *parameters))
+    return family, parameters

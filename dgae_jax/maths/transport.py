@@ -5,8 +5,9 @@ A value distribution is an array whose last axis holds F⁻¹(τ̂ᵢ), i = 0 �
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, ArrayLike, Float
+
+from dgae_jax.maths.risk import check_spectral
 
 
 def quantile_midpoints(k: int) -> Float[Array, " K"]:
@@ -17,17 +18,11 @@ def quantile_midpoints(k: int) -> Float[Array, " K"]:
 
 
 def spectral_weights(weights: ArrayLike) -> Float[Array, " K"]:
-    """Check that w ≥ 0 and ∫ w(q) dq = 1, that is mean(w) = 1 over the K midpoints.
+    """Weights that keep the directional metric translation and scale equivariant, on which the theorem's telescoping rests.
 
-    Both keep the directional metric translation and scale equivariant, on which the theorem's telescoping rests.
-    Traced weights pass unchecked: their values are not known yet.
+    Raises as `check_spectral`; traced weights pass unchecked, because their values are not known yet.
     """
-    if not isinstance(weights, jax.core.Tracer):
-        w = np.asarray(weights, np.float64)
-        if w.ndim != 1 or (w < 0).any() or not abs(w.mean() - 1) < 1e-5:
-            found = f"shape {w.shape}, minimum {w.min():g}, mean {w.mean():g}"
-            raise ValueError(f"spectral weights must be a vector, non-negative and of mean 1; got {found}")
-    return jnp.asarray(weights)
+    return jnp.asarray(weights if isinstance(weights, jax.core.Tracer) else check_spectral(weights), float)
 
 
 def directional_metric(

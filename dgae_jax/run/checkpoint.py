@@ -12,7 +12,8 @@ import numpy as np
 from flax import serialization
 
 from dgae_jax.configs.build import make_task, make_trainer, seed_keys
-from dgae_jax.configs.config import MAY_CHANGE, Config, ConfigError, differences, from_dict, to_dict
+from dgae_jax.configs.config import Config, ConfigError
+from dgae_jax.configs.serial import MAY_CHANGE, differences, from_dict, to_dict
 from dgae_jax.learn.types import TrainState
 from dgae_jax.run import files
 
@@ -101,7 +102,7 @@ def load(path: Path, config: Config) -> TrainState:
         if kind != f"{like.dtype}{like.shape}":
             raise CheckpointError(f"{path}: is of another run, {name} is {kind}, here {like.dtype}{like.shape}")
     for iteration in got["iteration"]:
-        if path.name != _name_of(int(iteration) * config.samples):
+        if path.name != _name_of(int(iteration) * config.samples_per_iteration):
             raise CheckpointError(f"{path}: is renamed, it was saved after {iteration} iterations")
 
     def restored(path, like):

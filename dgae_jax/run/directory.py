@@ -12,7 +12,8 @@ import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
-from dgae_jax.configs.config import Config, ConfigError, from_dict, to_dict
+from dgae_jax.configs.config import Config, ConfigError
+from dgae_jax.configs.serial import from_dict, to_dict
 from dgae_jax.configs.validation import validate
 from dgae_jax.run import files, manifest
 from dgae_jax.run.options import RunOptions

@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 
 from dgae_jax.configs.build import make_task, make_trainer, seed_keys
-from dgae_jax.configs.config import MAY_CHANGE, Config, ConfigError, differences, flag, resolve
+from dgae_jax.configs.config import Config, ConfigError, flag
+from dgae_jax.configs.serial import MAY_CHANGE, differences
 from dgae_jax.configs.validation import validate
 from dgae_jax.learn.types import TrainState
 from dgae_jax.run import checkpoint, directory, files, machine, manifest
@@ -54,11 +55,11 @@ def resume(config: Config, options: RunOptions) -> int:
 
 def _prepared(config: Config, options: RunOptions) -> Config:
     """The configuration in full, after a look at everything that can be seen before work begins."""
-    validate(config)
+    config = validate(config)
     validate_options(options)
     machine.use_device(config)
     machine.use_cache(options.cache_dir)
-    return resolve(config)
+    return config
 
 
 def _compare(config: Config, saved: Config, run_dir: Path, inexact: bool) -> None:
@@ -89,7 +90,7 @@ def _last_state(run_dir: Path, config: Config) -> TrainState | None:
         print(f"{run_dir} has no checkpoint yet: it starts again")
         return None
     state, path = checkpoint.newest(run_dir, config)
-    done = config.samples * int(state.iteration[0])
+    done = config.samples_per_iteration * int(state.iteration[0])
     if config.total_steps < done:
         raise ConfigError(f"--total-steps {config.total_steps}: must be at least the {done} that are done in {run_dir}")
     print(f"resuming from {path.name}")
@@ -122,12 +123,12 @@ def _run(config: Config, options: RunOptions, run_dir: Path, state: TrainState |
 
 def _iterate(config: Config, options: RunOptions, record: Record, signals: Signals, state: TrainState | None) -> TrainState:
     """All iterations that are left, dispatch by dispatch, until the budget is used, a signal came, or it broke down."""
-    every = max(1, options.checkpoint_every // config.samples)
+    every = max(1, options.checkpoint_every // config.samples_per_iteration)
     done, count, compiled = record.metrics.iteration, 1, False
     if state is not None and done == config.iterations:
         return state
     trainer = make_trainer(make_task(config), CAPACITY)
-    with Reporter(config.iterations * config.samples, config.num_seeds) as reporter:
+    with Reporter(config.iterations * config.samples_per_iteration, config.num_seeds) as reporter:
         if state is None:
             state = trainer.init(config, seed_keys(config))
         elif done % every == 0:
@@ -139,7 +140,7 @@ def _iterate(config: Config, options: RunOptions, record: Record, signals: Signa
             mean_return = record.append(state, measured, count)
             seconds, done = (time.monotonic() - since) / count, done + count
             if compiled:  # the first dispatch says nothing about speed
-                reporter.update(done * config.samples, config.samples / seconds, mean_return)
+                reporter.update(done * config.samples_per_iteration, config.samples_per_iteration / seconds, mean_return)
             count = int(np.clip(DISPATCH_SECONDS / seconds, 1, CAPACITY)) if compiled else 1
             compiled, broken, due = True, _broken(state, options), done % every == 0
             if due or done == config.iterations or signals.received or broken:
@@ -177,9 +178,10 @@ def _cannot_write(reason: OSError, run_dir: Path) -> int:
 
 
 def _budget(config: Config) -> str:
-    runs = f" × {config.num_seeds} seeds" if config.num_seeds > 1 else ""
-    used = f"{config.iterations:,} iterations × {config.samples:,} samples = {config.iterations * config.samples:,}"
-    return f"{config.env}-{config.env_version} {config.algo} on {config.physics}: {used} of {config.total_steps:,} steps{runs}"
+    runs, samples = f" × {config.num_seeds} seeds" if config.num_seeds > 1 else "", config.samples_per_iteration
+    used = f"{config.iterations:,} iterations × {samples:,} samples = {config.iterations * samples:,}"
+    task = config.env if config.env_version is None else f"{config.env}-{config.env_version}"
+    return f"{task} {config.algo} on {config.physics}: {used} of {config.total_steps:,} steps{runs}"
 
 
 def describe(result: dict[str, Any]) -> str:

@@ -23,7 +23,7 @@ class MetricsFile:
 
     def __init__(self, path: Path, config: Config, done: int):
         """Keep the rows of the first `done` iterations; raises ConfigError if the file lacks any of them."""
-        self.path, self.first_seed, self.seeds, self.samples = path, config.seed, config.num_seeds, config.samples
+        self.path, self.first_seed, self.seeds, self.samples = path, config.seed, config.num_seeds, config.samples_per_iteration
         self.iteration, self.seconds = 0, 0.0
         self.returns = array("d")
         """Episode returns of the rows so far, NaN where there was none."""

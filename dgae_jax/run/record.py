@@ -32,7 +32,7 @@ class Record:
         (run_dir / "checkpoints").mkdir(exist_ok=True)
         self.metrics = MetricsFile(run_dir / "metrics.jsonl", config, done)
         self.evaluations = EvaluationsFile(run_dir / "evaluations.jsonl")
-        self.evaluations.cut(done * config.samples, config.num_seeds)
+        self.evaluations.cut(done * config.samples_per_iteration, config.num_seeds)
         self.began = time.monotonic() - self.metrics.seconds
         self.beside, self.pending = ThreadPoolExecutor(1), Future()
         self.pending.set_result(None)
@@ -52,7 +52,7 @@ class Record:
     @property
     def steps(self) -> int:
         """Samples of each run so far."""
-        return self.metrics.iteration * self.config.samples
+        return self.metrics.iteration * self.config.samples_per_iteration
 
     @property
     def evaluated(self) -> bool:

@@ -11,7 +11,8 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 import dgae_jax as dg
-from dgae_jax.configs.config import ConfigError, from_dict, to_dict
+from dgae_jax.configs.config import ConfigError
+from dgae_jax.configs.serial import from_dict, to_dict
 from dgae_jax.configs.validation import validate
 from dgae_jax.run import checkpoint, files, manifest, metrics
 from dgae_jax.run.checkpoint import CheckpointError

@@ -7,12 +7,11 @@ import pytest
 import dgae_jax as dg
 from dgae_jax.configs.algorithms import TABLE, Row
 from dgae_jax.configs.config import resolve
+from dgae_jax.configs.parts import CRITICS, DESCENT, RESIDUALS, TARGETS, UPDATES, Part
 from dgae_jax.configs.presets import PRESETS
 from dgae_jax.configs.validation import validate
 from dgae_jax.envs.registry import TASKS
-from dgae_jax.learn.critics import CRITICS, RESIDUALS, TARGETS
-from dgae_jax.learn.types import Part
-from dgae_jax.learn.updates import DESCENT, UPDATES, descend, surrogate
+from dgae_jax.learn.updates import descend, surrogate
 from tests.probes import Target
 
 
@@ -21,14 +20,14 @@ def test_every_row_names_parts_that_exist():
         assert row.critic in CRITICS
         assert row.residual in RESIDUALS
         assert row.target in TARGETS
-        assert row.update in UPDATES
+        assert row.policy_update in UPDATES
 
 
 def test_a_distributional_variant_differs_from_its_baseline_in_critic_residual_and_target_only():
     for name in ("ppo", "trpo", "a2c"):
         baseline, variant = TABLE[name], TABLE["d" + name]
-        assert variant == Row("quantile", "distributional", "sr-lambda", baseline.update)
-        assert baseline == Row("scalar", "td", "lambda-return", baseline.update)
+        assert variant == Row("quantile", "distributional", "sr-lambda", baseline.policy_update)
+        assert baseline == Row("scalar", "td", "lambda-return", baseline.policy_update)
 
 
 def test_parts_named_in_the_configuration_take_the_place_of_the_rows():
@@ -50,9 +49,9 @@ def test_the_paper_preset_has_the_papers_networks_budgets_and_rollouts(algo, env
     config, ant = dg.preset("paper", algo, env), env == "ant"
     assert config.policy.hidden == config.critic.hidden == ((512, 512) if ant else (256, 256))
     assert config.total_steps == (10_000_000 if env in ("ant", "hopper") else 5_000_000)
-    assert config.critic.quantiles == 64
+    assert config.critic.quantiles == (64 if TABLE[algo].critic == "quantile" else None)
     rollouts = {"clip": (4096, 2048), "trust-region": (50_000, 25_000), "gradient": (80, 80)}
-    assert config.samples == rollouts[TABLE[algo].update][0 if ant else 1]
+    assert config.samples_per_iteration == rollouts[TABLE[algo].policy_update][0 if ant else 1]
 
 
 @pytest.mark.parametrize("update", UPDATES)

@@ -5,7 +5,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dgae_jax.configs.config import Config, ConfigError, CriticConfig, PolicyConfig, from_dict, resolve, to_dict
+from dgae_jax import Config, ConfigError, CriticConfig, PolicyConfig
+from dgae_jax.configs.config import resolve
+from dgae_jax.configs.serial import from_dict, to_dict
 from dgae_jax.configs.validation import validate
 
 
@@ -28,12 +30,12 @@ def test_the_default_configuration_is_valid():
         ("algo", "sac", "one of ppo, dppo"),
         ("physics", "bullet", "one of jax, native"),
         ("seed", -1, "from 0 to"),
-        ("num_seeds", 0, "at least 1"),
+        ("num_seeds", 0, "from 1 to 4,096"),
         ("total_steps", 2047, "at least one iteration of num_envs \\* horizon = 2,048"),
-        ("total_steps", 2**31, "at most 2,147,483,647"),
-        ("num_envs", -3, "at least 1"),
-        ("horizon", 0, "at least 1"),
-        ("episode_length", 0, "at least 1"),
+        ("total_steps", 2**31, "to 2,147,483,647"),
+        ("num_envs", -3, "a whole number from 1 to"),
+        ("horizon", 0, "a whole number from 1 to"),
+        ("episode_length", 0, "a whole number from 1 to"),
         ("gamma", 1.01, "from 0 to 1"),
         ("gamma", float("nan"), "from 0 to 1"),
         ("lam", -0.1, "from 0 to 1"),
@@ -44,23 +46,22 @@ def test_the_default_configuration_is_valid():
         ("policy.clip", -0.2, "above 0"),
         ("policy.learning_rate", float("inf"), "above 0"),
         ("policy.learning_rate_end", 2.0, "from 0 to 1"),
-        ("policy.epochs", 0, "at least 1"),
+        ("policy.epochs", 0, "a whole number from 1 to"),
         ("policy.minibatches", 7, "a divisor of num_envs \\* horizon = 2,048"),
         ("policy.max_grad_norm", 0.0, "above 0"),
         ("critic.minibatches", 3, "a divisor of num_envs \\* horizon = 2,048"),
-        ("critic.target", "td", "one of default, bellman"),
-        ("critic.quantiles", 0, "at least 1"),
+        ("critic.target", "td", "one of bellman"),
+        ("critic.quantiles", 0, "a whole number from 1 to"),
         ("critic.kappa", 0.0, "above 0"),
     ],
 )
 def test_a_bad_value_is_refused_by_flag_value_and_what_is_allowed(path, value, allowed):
-    flag = "--" + path.replace("_", "-")
-    with pytest.raises(ConfigError, match=f"^{flag} .*: must be .*{allowed}"):
+    with pytest.raises(ConfigError, match=f"^{path} .*: must be .*{allowed}"):
         validate(changed(path, value))
 
 
 def test_a_setting_the_algorithm_does_not_use_is_refused():
-    with pytest.raises(ConfigError, match=r"--critic.quantiles 32: must be left out: ppo with scalar does not use it"):
+    with pytest.raises(ConfigError, match=r"critic.quantiles 32: must be left out: ppo with scalar does not use it"):
         validate(dataclasses.replace(changed("critic.quantiles", 32), algo="ppo"))
 
 
@@ -93,7 +94,7 @@ def test_a_configuration_survives_json(config):
         (lambda d: d.update(extra=1), "extra: unknown"),
         (lambda d: d.update(num_envs="16"), "num_envs: must be int"),
         (lambda d: d.update(num_envs=True), "num_envs: must be int"),
-        (lambda d: d.update(policy=3), "policy.: must be an object"),
+        (lambda d: d.update(policy=3), "policy: must be an object"),
         (lambda d: d["critic"].update(hidden="64"), "critic.hidden: must be tuple"),
         (lambda d: d["critic"].update(kapa=1), "critic.kapa: unknown"),
     ],

@@ -10,7 +10,7 @@ import optax
 import pytest
 from numpy.testing import assert_allclose
 
-from dgae_jax.learn import critics
+from dgae_jax.configs.parts import CRITICS, TARGETS
 from dgae_jax.learn.types import Batch
 from dgae_jax.maths.returns import decay
 
@@ -32,7 +32,7 @@ def episodes(end):
 def fixed_point(kind, target, lam, end="terminal"):
     """The quantiles of a table (a linear network on one-hot observations) after fitting one target for long."""
     options = {"quantiles": 4, "kappa": 1e-2} if kind == "quantile" else {}
-    critic = critics.CRITICS[kind].build(3, hidden=(), target=target, **options)
+    critic = CRITICS[kind].build(3, hidden=(), target=TARGETS[target].build, **options)
     obs, reward, terminated, next_obs = episodes(end)
     discount, trace = decay(terminated, jnp.zeros_like(terminated).at[-1].set(True), gamma=0.5, lam=lam)
     steps = 1500
@@ -77,7 +77,7 @@ def test_the_shifted_target_counts_the_spread_of_the_bootstrap_twice():
     assert got.std() > 1.05 * jnp.array(TRUE["first"]).std()
 
 
-@pytest.mark.parametrize("target", sorted(critics.TARGETS))
+@pytest.mark.parametrize("target", sorted(TARGETS))
 def test_a_scalar_critic_learns_the_mean_from_every_target(target):
     got = fixed_point("scalar", target, 0.5)
     assert_allclose(got["first"], [0], atol=0.05)

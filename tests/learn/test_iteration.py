@@ -12,13 +12,13 @@ from numpy.testing import assert_allclose, assert_array_equal
 import dgae_jax as dg
 from dgae_jax.configs.build import make_greedy, make_trainer, seed_keys
 from dgae_jax.learn import normalizers
-from tests.helpers import SMALL
+from tests.helpers import SMALL, small
 from tests.probes import Coin, Constant, Delayed, Fragile, Target
 
 
 @cache
 def hopper(algo):
-    config = dataclasses.replace(SMALL, algo=algo)
+    config = small(algo)
     env = dg.make_env("hopper", physics="native")
     return config, make_trainer(env, 4)
 
@@ -84,7 +84,8 @@ def test_floats_of_the_configuration_may_be_swept_in_one_program():
     @jax.jit
     @jax.vmap
     def moved(rate):
-        config = dataclasses.replace(SMALL, algo="ppo", policy=dataclasses.replace(SMALL.policy, learning_rate=rate))
+        config = small("ppo")
+        config = dataclasses.replace(config, policy=dataclasses.replace(config.policy, learning_rate=rate))
         init, step = dg.make_train(dg.make_algorithm("ppo", env, config), env, config)
         state = init(jax.random.key(0))
         after, _ = step(state)
@@ -114,7 +115,9 @@ ALL = ["ppo", "dppo", "trpo", "dtrpo", "a2c", "da2c"]
 def learn(env, algo, iterations, **changes):
     fit = {"hidden": (16,), "epochs": 4, "minibatches": 4, "learning_rate": 3e-3, "learning_rate_end": 1.0}
     policy = {**fit, "epochs": 1, "minibatches": 1, "learning_rate": 3e-2} if "a2c" in algo else fit
-    critic = dg.CriticConfig(**fit, quantiles=8, **changes.pop("critic", {}))
+    policy = {"hidden": (16,)} if "trpo" in algo else policy
+    quantiles = {"quantiles": 8} if algo.startswith("d") else {}
+    critic = dg.CriticConfig(**fit, **quantiles, **changes.pop("critic", {}))
     config = dg.Config(
         algo=algo, num_envs=32, horizon=8, total_steps=256 * iterations, policy=dg.PolicyConfig(**policy), critic=critic, **changes
     )

@@ -8,13 +8,13 @@ import scipy.linalg
 from jax.flatten_util import ravel_pytree
 from numpy.testing import assert_allclose
 
-from dgae_jax.learn.networks import gaussian_policy
+from dgae_jax.learn.networks import SharedCovariance, gaussian_policy
 from dgae_jax.learn.types import Batch, Fit
 from dgae_jax.learn.updates import fisher_product, surrogate, trust_region
 from dgae_jax.maths import gaussian
 from tests.helpers import distance
 
-POLICY = gaussian_policy(3, 2, hidden=(5,), covariance="shared", initial_std=0.7)
+POLICY = gaussian_policy(3, 2, hidden=(5,), covariance=SharedCovariance, initial_std=0.7)
 
 
 def example(seed=0, count=200):

@@ -4,17 +4,18 @@ import optax
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
+from dgae_jax.configs.parts import TARGETS
 from dgae_jax.learn import critics
-from dgae_jax.learn.networks import gaussian_policy
+from dgae_jax.learn.networks import SharedCovariance, StateCovariance, gaussian_policy
 from dgae_jax.learn.types import Batch, Fit
-from dgae_jax.learn.updates import descent, sgd, surrogate
+from dgae_jax.learn.updates import adam, descent, sgd, surrogate
 from dgae_jax.maths import gaussian
 from tests.helpers import distance
 
 
 @pytest.fixture
 def policy():
-    return gaussian_policy(3, 2, hidden=(8,), covariance="shared", initial_std=1.0)
+    return gaussian_policy(3, 2, hidden=(8,), covariance=SharedCovariance, initial_std=1.0)
 
 
 @pytest.fixture
@@ -92,7 +93,7 @@ def test_a_batch_that_does_not_divide_is_refused(policy, params, batch, key):
 
 def test_the_learning_rate_falls_linearly_to_its_last_fraction():
     # Adam's first steps on a constant gradient are one learning rate long
-    optimizer = descent("adam", 0.1, final_fraction=0.5, gradient_steps=4, max_norm=1e9)
+    optimizer = descent(adam, 0.1, final_fraction=0.5, gradient_steps=4, max_norm=1e9)
     params = jnp.array([0.0])
     state, steps = optimizer.init(params), []
     for _ in range(6):
@@ -103,7 +104,7 @@ def test_the_learning_rate_falls_linearly_to_its_last_fraction():
 
 def test_the_clip_bounds_the_global_norm_of_a_gradient():
     optimizer = optax.chain(optax.clip_by_global_norm(1.0), optax.sgd(1.0))
-    ours = descent("adam", 1.0, final_fraction=1.0, gradient_steps=1, max_norm=1.0)
+    ours = descent(adam, 1.0, final_fraction=1.0, gradient_steps=1, max_norm=1.0)
     gradient = {"a": jnp.array([3.0]), "b": jnp.array([4.0])}
     assert_allclose(optimizer.update(gradient, optimizer.init(gradient))[0]["b"], -0.8)
     moments = ours.update(gradient, ours.init(gradient), gradient)[1]
@@ -114,12 +115,12 @@ def test_the_clip_bounds_the_global_norm_of_a_gradient():
 
 
 def critic_of(kind, target):
-    options = {"hidden": (8,), "target": target}
+    options = {"hidden": (8,), "target": TARGETS[target].build}
     return critics.scalar(3, **options) if kind == "scalar" else critics.quantile(3, **options, quantiles=4, kappa=1.0)
 
 
 def test_a_sample_that_is_not_sound_weighs_nothing_in_policy_and_critic(policy, params, batch, key):
-    critic = critics.quantile(3, hidden=(4,), target="sr-lambda", quantiles=1, kappa=1.0)
+    critic = critics.quantile(3, hidden=(4,), target=critics.SR_LAMBDA, quantiles=1, kappa=1.0)
     values = critic.init(key)
     broken = batch._replace(
         sound=batch.sound.at[5].set(False),
@@ -136,7 +137,7 @@ def test_a_sample_that_is_not_sound_weighs_nothing_in_policy_and_critic(policy, 
 
 
 @pytest.mark.parametrize("kind", ["scalar", "quantile"])
-@pytest.mark.parametrize("target", critics.TARGETS)
+@pytest.mark.parametrize("target", TARGETS)
 def test_every_critic_takes_every_target(kind, target, key):
     critic = critic_of(kind, target)
     params, (obs, next_obs) = critic.init(key), jax.random.normal(key, (2, 6, 5, 3))
@@ -171,7 +172,7 @@ def test_no_gradient_flows_through_the_bellman_target(batch, key):
 # ---- policy networks ----
 
 
-@pytest.mark.parametrize("covariance", ["shared", "state"])
+@pytest.mark.parametrize("covariance", [SharedCovariance, StateCovariance])
 def test_a_fresh_policy_is_wide_noise_around_zero(covariance, key):
     policy = gaussian_policy(3, 2, hidden=(16, 16), covariance=covariance, initial_std=0.7)
     mean, log_std = policy.apply(policy.init(key), jax.random.normal(key, (5, 4, 3)))
@@ -182,14 +183,14 @@ def test_a_fresh_policy_is_wide_noise_around_zero(covariance, key):
 
 def test_the_shared_covariance_is_the_same_everywhere_and_the_states_is_not(key):
     obs = jax.random.normal(key, (5, 3))
-    for covariance, spread in (("shared", False), ("state", True)):
+    for covariance, spread in ((SharedCovariance, False), (StateCovariance, True)):
         policy = gaussian_policy(3, 2, hidden=(16,), covariance=covariance, initial_std=1.0)
         log_std = policy.apply(policy.init(key), obs).log_std
         assert bool((log_std[0] != log_std[1]).any()) == spread
 
 
 def test_hidden_weights_are_orthogonal(key):
-    params = gaussian_policy(8, 2, hidden=(8,), covariance="shared", initial_std=1.0).init(key)
+    params = gaussian_policy(8, 2, hidden=(8,), covariance=SharedCovariance, initial_std=1.0).init(key)
     weight = params["params"]["Torso_0"]["Dense_0"]["kernel"]
     assert_allclose(weight @ weight.T, 2 * jnp.eye(8), atol=1e-5)
     assert_array_equal(params["params"]["Torso_0"]["Dense_0"]["bias"], 0)

@@ -10,7 +10,8 @@ from matplotlib.image import imread
 
 import dgae_jax as dg
 from dgae_jax.configs.build import make_task, make_trainer, seed_keys
-from dgae_jax.configs.config import ConfigError, to_dict
+from dgae_jax.configs.config import ConfigError
+from dgae_jax.configs.serial import to_dict
 from dgae_jax.run import checkpoint, curve, directory, files, metrics
 from dgae_jax.run.checkpoint import CheckpointError
 from dgae_jax.run.evaluation import EvaluationsFile, evaluate_state
@@ -26,7 +27,7 @@ def state():
 
 def saved(state, directory, steps, **keep):
     """A checkpoint of `state` after so many samples."""
-    then = state._replace(iteration=jnp.full_like(state.iteration, steps // SMALL.samples))
+    then = state._replace(iteration=jnp.full_like(state.iteration, steps // SMALL.samples_per_iteration))
     return checkpoint.save(directory, SMALL, checkpoint.arrays_of(then), steps, **keep)
 
 

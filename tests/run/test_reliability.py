@@ -30,7 +30,9 @@ from tests.helpers import ROOT, SMALL, TINY
 
 ITERATIONS = 8
 QUIET = RunOptions(
-    cache_dir=str(Path(tempfile.gettempdir()) / "dgae_jax_tests"), episodes=1, checkpoint_every=ITERATIONS // 2 * SMALL.samples
+    cache_dir=str(Path(tempfile.gettempdir()) / "dgae_jax_tests"),
+    episodes=1,
+    checkpoint_every=ITERATIONS // 2 * 64,
 )
 
 
@@ -46,7 +48,7 @@ def _compiled_once():
 def small(algo, physics="native", seeds=1):
     policy = dg.PolicyConfig(hidden=(8,)) if "trpo" in algo else SMALL.policy
     critic = SMALL.critic if algo[0] == "d" else dataclasses.replace(SMALL.critic, quantiles=64)
-    steps = ITERATIONS * SMALL.samples
+    steps = ITERATIONS * SMALL.samples_per_iteration
     shape = {"total_steps": steps, "episode_length": 20, "num_seeds": seeds}
     return dataclasses.replace(SMALL, algo=algo, physics=physics, policy=policy, critic=critic, **shape)
 
@@ -117,7 +119,7 @@ def test_a_changed_setting_is_refused_with_both_values(change, message, finished
 def test_a_finished_run_may_be_given_a_larger_budget(finished, tmp_path):
     longer = tmp_path / "longer"
     shutil.copytree(finished, longer)
-    config = dataclasses.replace(small("ppo"), total_steps=10 * SMALL.samples)
+    config = dataclasses.replace(small("ppo"), total_steps=10 * SMALL.samples_per_iteration)
     assert resume(config, dataclasses.replace(QUIET, resume=longer)) == 0
     assert [row["iteration"] for row in metrics.read(longer / "metrics.jsonl")] == list(range(1, 11))
     assert directory.read_config(longer).total_steps == config.total_steps

@@ -1,0 +1,54 @@
+from .configs.build import Config, ConfigError, CriticConfig, NoiseConfig, PolicyConfig, make_algorithm, make_train
+from .configs.presets import preset
+from .envs.registry import make_env
+from .maths.returns import (
+    bellman_target,
+    dgae,
+    distributional_td_residual,
+    gae,
+    lambda_return,
+    lambda_shift_target,
+    lambda_sum,
+    n_step_advantage,
+    sr_lambda_target,
+    td_residual,
+)
+from .maths.risk import METRICS, weights_of
+from .maths.statistics import bootstrap_interval, coverage, crps, explained_variance, iqm, pit
+from .maths.transport import directional_metric, quantile_huber_loss, quantile_midpoints, wasserstein
+
+__version__: str
+
+__all__ = [
+    "METRICS",
+    "Config",
+    "ConfigError",
+    "CriticConfig",
+    "NoiseConfig",
+    "PolicyConfig",
+    "bellman_target",
+    "bootstrap_interval",
+    "coverage",
+    "crps",
+    "dgae",
+    "directional_metric",
+    "distributional_td_residual",
+    "explained_variance",
+    "gae",
+    "iqm",
+    "lambda_return",
+    "lambda_shift_target",
+    "lambda_sum",
+    "make_algorithm",
+    "make_env",
+    "make_train",
+    "n_step_advantage",
+    "pit",
+    "preset",
+    "quantile_huber_loss",
+    "quantile_midpoints",
+    "sr_lambda_target",
+    "td_residual",
+    "wasserstein",
+    "weights_of",
+]

@@ -1,0 +1,61 @@
+"""Many iterations per dispatch, many runs side by side: the compiled programs of a run."""
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import ArrayLike
+
+from dgae_jax.learn.iteration import Metrics
+from dgae_jax.learn.types import TrainState
+
+
+class Trainer(NamedTuple):
+    """The compiled programs of a run, over all its seeds at once; every leaf of the state has a leading seed axis."""
+
+    init: Callable[[Any, jax.Array], TrainState]
+    """`init(config, keys [S]) -> state`."""
+    dispatch: Callable[[Any, TrainState, int], tuple[TrainState, Metrics]]
+    """`dispatch(config, state, count) -> (state, metrics [capacity, S])`: `count <= capacity` iterations; rows from
+    `count` on are zero. The state handed in is consumed."""
+
+
+def make_trainer(make_train: Callable[[Any], tuple[Callable, Callable]], capacity: int) -> Trainer:
+    """Compile once, run any number of iterations per call; traced leaves of the configuration may change between calls.
+
+    `make_train(config) -> (init(key) -> state, train_step(state) -> (state, metrics))`.
+    """
+
+    @jax.jit
+    def init(config: Any, keys: jax.Array) -> TrainState:
+        return over_seeds(make_train(config)[0])(keys)
+
+    @partial(jax.jit, donate_argnums=1)
+    def dispatch(config: Any, state: TrainState, count: ArrayLike):
+        step = jax.jit(over_seeds(make_train(config)[1]))  # jitted, so that asking for its shapes does not trace it twice
+        rows = jax.tree.map(lambda x: jnp.zeros((capacity, *x.shape), x.dtype), jax.eval_shape(step, state)[1])
+
+        def iteration(i, carry):
+            state, rows = carry
+            state, row = step(state)
+            return state, jax.tree.map(lambda all, one: all.at[i].set(one), rows, row)
+
+        return jax.lax.fori_loop(0, count, iteration, (state, rows))
+
+    return Trainer(init, dispatch)
+
+
+def over_seeds(f: Callable) -> Callable:
+    """`f` mapped over the leading axis of its argument.
+
+    An axis of one is taken off and put back: XLA's CPU code for arrays with a leading 1 is several times slower.
+    """
+
+    def mapped(tree):
+        if jax.tree.leaves(tree)[0].shape[0] > 1:
+            return jax.vmap(f)(tree)
+        return jax.tree.map(lambda x: jnp.expand_dims(x, 0), f(jax.tree.map(lambda x: x[0], tree)))
+
+    return mapped
