@@ -16,6 +16,7 @@ from .maths.returns import (
 from .maths.risk import METRICS, weights_of
 from .maths.statistics import bootstrap_interval, coverage, crps, explained_variance, iqm, pit
 from .maths.transport import directional_metric, quantile_huber_loss, quantile_midpoints, wasserstein
+from .run.api import Run, load_policy, train
 
 __version__: str
 
@@ -26,6 +27,7 @@ __all__ = [
     "CriticConfig",
     "NoiseConfig",
     "PolicyConfig",
+    "Run",
     "bellman_target",
     "bootstrap_interval",
     "coverage",
@@ -39,6 +41,7 @@ __all__ = [
     "lambda_return",
     "lambda_shift_target",
     "lambda_sum",
+    "load_policy",
     "make_algorithm",
     "make_env",
     "make_train",
@@ -49,6 +52,7 @@ __all__ = [
     "quantile_midpoints",
     "sr_lambda_target",
     "td_residual",
+    "train",
     "wasserstein",
     "weights_of",
 ]

@@ -10,10 +10,12 @@ import tyro
 
 from dgae_jax import ConfigError
 from dgae_jax.cli.arguments import fail, parse
-from dgae_jax.run import directory, files
+from dgae_jax.run import directory, files, machine, terminal
 from dgae_jax.run.checkpoint import CheckpointError
-from dgae_jax.run.evaluation import evaluate_run
-from dgae_jax.run.loop import describe
+from dgae_jax.run.evaluation import default_path, engines_of, evaluate_run
+from dgae_jax.run.options import RunOptions
+from dgae_jax.run.progress import Reporter
+from dgae_jax.run.summary import describe
 
 
 @dataclass(frozen=True)
@@ -22,8 +24,9 @@ class Arguments:
 
     run_dir: tyro.conf.Positional[Path]
     """Directory of the run [path]."""
-    engine: Literal["gymnasium", "native", "jax"] = "gymnasium"
-    """gymnasium (the task of the gymnasium package), native (ours in C MuJoCo) or jax (ours in JAX)."""
+    engine: Literal["gymnasium", "native", "jax"] | None = None
+    """gymnasium (the task of the gymnasium package), native (ours in C MuJoCo) or jax (ours in JAX); by default the first
+    that the run can have."""
     checkpoint: Literal["newest", "best"] = "newest"
     """newest, or best: of the evaluations while it trained, whose episodes chose it; take another --seed to judge it."""
     episodes: int = 20
@@ -31,7 +34,9 @@ class Arguments:
     seed: int = 0
     """Seed of the initial states [1]."""
     out: Path | None = None
-    """File to write; by default evaluation-ENGINE.json in the run directory [path]."""
+    """File to write; by default evaluation-ENGINE.json or evaluation-ENGINE-best.json in the run directory [path]."""
+    cache_dir: str = RunOptions.cache_dir
+    """Where compiled programs are kept between runs; none disables [path]."""
 
 
 def main() -> int:
@@ -45,22 +50,28 @@ def main() -> int:
         fail(f"--out {arguments.out}: must be a file in a directory that exists")
     if arguments.out and (arguments.out.is_symlink() or (arguments.out.exists() and not arguments.out.is_file())):
         fail(f"--out {arguments.out}: must be a file, not a directory, a link or a device")
-    out = arguments.out or arguments.run_dir / f"evaluation-{arguments.engine}.json"
-    if arguments.run_dir.is_dir() and not os.access(out.absolute().parent, os.W_OK):
-        fail(f"--out {out}: must be a file that can be written")
+    terminal.prepare()
+    out = arguments.out
     try:
         config = directory.read_config(arguments.run_dir)
-        how = {"which": arguments.checkpoint, "engine": arguments.engine, "episodes": arguments.episodes, "seed": arguments.seed}
-        result = evaluate_run(arguments.run_dir, config, **how)
+        engine = arguments.engine or engines_of(config)[0]
+        out = out or default_path(arguments.run_dir, engine, arguments.checkpoint)
+        if not os.access(out.absolute().parent, os.W_OK):
+            fail(f"--out {out}: must be a file that can be written")
+        machine.use_device(config)
+        machine.use_cache(arguments.cache_dir)
+        how = {"which": arguments.checkpoint, "engine": engine, "episodes": arguments.episodes, "seed": arguments.seed}
+        with Reporter() as reporter:
+            result = evaluate_run(arguments.run_dir, config, **how, watch=reporter.watch)
         files.write_json(out, result)
     except (ConfigError, CheckpointError) as mistake:
         fail(str(mistake))
     except OSError as reason:
         fail(f"--out {out}: must be a file that can be written ({reason.strerror})")
     except KeyboardInterrupt:
-        print("stopped by SIGINT, nothing written", file=sys.stderr)
+        terminal.warn("stopped by SIGINT, nothing written")
         return 130
-    print(f"{describe(result)}, {result['checkpoint']}; written to {out}")
+    terminal.say(f"{describe(result)}, {result['checkpoint']}; written to {out}")
     return 0
 
 

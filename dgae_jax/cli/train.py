@@ -10,9 +10,9 @@ import tyro
 from dgae_jax import Config, ConfigError
 from dgae_jax.cli.arguments import fail, parse, peek
 from dgae_jax.configs import presets
-from dgae_jax.run import directory, manifest
+from dgae_jax.run import directory, manifest, terminal
 from dgae_jax.run.checkpoint import CheckpointError
-from dgae_jax.run.loop import resume, train
+from dgae_jax.run.loop import resume, resume_or_start, train
 from dgae_jax.run.options import RunOptions
 
 
@@ -33,13 +33,15 @@ def main() -> int:
 
     0 done; 1 broke down or could write no more; 2 bad input; 130 / 143 stopped by SIGINT / SIGTERM with a checkpoint saved.
     """
+    terminal.prepare()
     try:
         first = peek(preset="", algo=Config.algo, env=Config.env, policy_update="default", config="", resume="")
         config = _start(**first)
         description = "Train a policy on a MuJoCo task with PPO, TRPO, A2C or their distributional variants."
         run = manifest.options(Path(first["resume"])) if first["resume"] else RunOptions()
         arguments = parse(Arguments, description, default=Arguments(settings=config, run=run))
-        return (resume if arguments.run.resume else train)(arguments.settings, arguments.run)
+        work = resume_or_start if arguments.run.resume_or_start else resume if arguments.run.resume else train
+        return work(arguments.settings, arguments.run)
     except (ConfigError, CheckpointError) as mistake:
         fail(str(mistake))
     except KeyboardInterrupt:

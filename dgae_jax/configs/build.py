@@ -2,7 +2,7 @@
 
 import dataclasses
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -16,8 +16,8 @@ from dgae_jax.envs.noise import Noisy
 from dgae_jax.envs.registry import make_env
 from dgae_jax.learn import diagnostics, iteration, parallel
 from dgae_jax.learn.networks import gaussian_policy
-from dgae_jax.learn.normalizers import normalize
-from dgae_jax.learn.types import Algorithm, Policy, TrainState
+from dgae_jax.learn.normalizers import Statistics, normalize
+from dgae_jax.learn.types import Algorithm, Params, Policy, TrainState
 from dgae_jax.learn.updates import descend
 from dgae_jax.maths.risk import weights_of
 
@@ -107,12 +107,35 @@ def seed_keys(config: Config) -> jax.Array:
     return jnp.stack([jax.random.key(config.seed + i) for i in range(config.num_seeds)])
 
 
-def make_greedy(env: Env, config: Config) -> Callable[[TrainState, jax.Array], jax.Array]:
-    """`greedy(state, obs [..., O]) -> action [..., A]`: the mean action of one trained run, within the actuators' range."""
-    policy, (low, high) = make_policy(env, config), env.action_range
+class Fitted(NamedTuple):
+    """A network of a trained run and the statistics that its observations are normalised by: all that using it takes."""
 
-    def greedy(state: TrainState, obs: jax.Array) -> jax.Array:
-        distribution = policy.apply(state.policy.params, normalize(state.observations, obs))
-        return jnp.clip(distribution.mean, low, high)
+    params: Params
+    observations: Statistics
+
+
+def policies_of(state: TrainState) -> Fitted:
+    """The policies of a training state; leaves keep its leading axis of runs."""
+    return Fitted(state.policy.params, state.observations)
+
+
+def make_greedy(env: Env, config: Config) -> Callable[[Fitted, jax.Array], jax.Array]:
+    """`greedy(policy, obs [..., O]) -> action [..., A]`: the mean action of one run's policy, within the actuators' range."""
+    network, (low, high) = make_policy(env, config), env.action_range
+
+    @jax.default_matmul_precision("highest")  # as in training
+    def greedy(policy: Fitted, obs: jax.Array) -> jax.Array:
+        return jnp.clip(network.apply(policy.params, normalize(policy.observations, obs)).mean, low, high)
 
     return greedy
+
+
+def make_quantiles(env: Env, config: Config) -> Callable[[Fitted, jax.Array], jax.Array]:
+    """`quantiles(critic, obs [..., O]) -> [..., K]`: the value distribution of one run's critic, of scaled returns."""
+    network = make_algorithm(str(config.algo), env, config).critic
+
+    @jax.default_matmul_precision("highest")
+    def quantiles(critic: Fitted, obs: jax.Array) -> jax.Array:
+        return network.predict(critic.params, normalize(critic.observations, obs))
+
+    return quantiles

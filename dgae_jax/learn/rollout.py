@@ -108,22 +108,3 @@ def rollout(
         return _advance(episodes, after, step, start(env, reset_key, sound.shape[0])), step
 
     return jax.lax.scan(one, episodes, jax.random.split(key, horizon))
-
-
-def evaluate(env: Env, act: Callable[[Array], Array], key: Key[Array, ""], *, episodes: int, episode_length: int) -> Float[Array, " E"]:
-    """Undiscounted returns of `act(obs [E, O]) -> action [E, A]` in independent episodes, side by side until all end."""
-    low, high = env.action_range
-
-    def going(carry):
-        _, _, alive, step = carry
-        return alive.any() & (step < episode_length)
-
-    def one(carry):
-        state, total, alive, step = carry
-        state = jax.vmap(env.step)(state, jnp.clip(act(state.obs), low, high))
-        total = total + jnp.where(alive, state.reward, 0)
-        return state, total, alive & (state.done == 0), step + 1
-
-    state = jax.vmap(env.reset)(jax.random.split(key, episodes))
-    carry = (state, jnp.zeros_like(state.reward), jnp.full(episodes, True), jnp.int32(0))
-    return jax.lax.while_loop(going, one, carry)[1]

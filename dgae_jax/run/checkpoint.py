@@ -1,24 +1,33 @@
-"""The whole training state in one file of plain data (msgpack): loading it runs no code."""
+"""One file of plain data (msgpack) per checkpoint: loading it runs no code, and takes no more memory than what is expected of it.
+
+A file is one line of JSON with schema and checksum, and then, in msgpack, the arrays by name and the configuration. What the
+arrays should be, a tree of shapes, and whether the configuration fits is for the caller to say.
+"""
 
 import hashlib
 import json
 import re
-import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
+from typing import Any, BinaryIO, TypeVar
 
 import jax
 import jax.numpy as jnp
+import msgpack
 import numpy as np
-from flax import serialization
 
-from dgae_jax.configs.build import make_task, make_trainer, seed_keys
 from dgae_jax.configs.config import Config, ConfigError
-from dgae_jax.configs.serial import MAY_CHANGE, differences, from_dict, to_dict
-from dgae_jax.learn.types import TrainState
+from dgae_jax.configs.serial import from_dict, to_dict
 from dgae_jax.run import files
 
-SCHEMA = 1
-"""Version of the file format."""
+T = TypeVar("T")
+
+SCHEMA = 2
+"""Version of the file format. In 1 the physics `jax` was called `mjx`."""
+
+ARRAY = 1
+"""Msgpack's extension type of an array: shape, name of the dtype and bytes, as Flax writes it."""
 
 
 class CheckpointError(ValueError):
@@ -29,28 +38,36 @@ class DamagedError(CheckpointError):
     """A checkpoint whose bytes are not what was written; an older one may be whole."""
 
 
-def arrays_of(state: TrainState) -> dict[str, np.ndarray]:
-    """A copy of the state's arrays by name."""
-    return {name: np.array(x) for name, x in _plain(state).items()}
+class NotFiniteError(CheckpointError):
+    """A state that must not be saved, continued or evaluated: a number in it is NaN or infinite."""
+
+
+def arrays_of(tree: Any) -> dict[str, np.ndarray]:
+    """A copy of the tree's arrays by name, as `save` takes them."""
+    return {name: np.array(x) for name, x in sorted(_plain(tree).items())}
 
 
 def save(directory: Path, config: Config, arrays: dict[str, np.ndarray], steps: int, keep: int = 3, best: int | None = None) -> Path:
     """Write `steps_….msgpack`, complete or not at all, and delete all but the newest `keep` and that of `best` steps.
 
-    Files of more steps do not count: the run went back behind them because they were damaged. The file is one line of JSON, with
-    schema and checksum, and the configuration and the arrays in msgpack.
+    Files of more steps do not count: the run went back behind them because they were damaged. Raises NotFiniteError, and
+    writes nothing, if a number is not finite.
     """
-    path = directory / _name_of(steps)
-    body = serialization.msgpack_serialize({"config": json.dumps(to_dict(config)), "arrays": arrays})
+    for name in not_finite(arrays):
+        raise NotFiniteError(f"{name} is not finite after {steps:,} samples")
+    packed = {name: msgpack.ExtType(ARRAY, msgpack.packb((x.shape, x.dtype.name, x.tobytes()))) for name, x in arrays.items()}
+    body = msgpack.packb({"arrays": packed, "config": json.dumps(to_dict(config))})
     header = {"schema": SCHEMA, "sha256": hashlib.sha256(body).hexdigest()}
+    path = directory / name_of(steps)
     files.replace(path, json.dumps(header).encode() + b"\n" + body)
     for old in [p for p in found(directory) if p.name <= path.name][:-keep]:
-        if best is None or old.name != _name_of(best):
+        if best is None or old.name != name_of(best):
             old.unlink(missing_ok=True)
     return path
 
 
-def _name_of(steps: int) -> str:
+def name_of(steps: int) -> str:
+    """The file of the state after so many samples."""
     return f"steps_{steps:012d}.msgpack"
 
 
@@ -60,92 +77,147 @@ def found(directory: Path) -> list[Path]:
     return sorted(p for p in named if p.is_file() and not p.is_symlink())
 
 
-def newest(run_dir: Path, config: Config) -> tuple[TrainState, Path]:
-    """The state of the newest checkpoint that is whole, and its file; warns of damaged ones.
+def not_finite(arrays: dict[str, np.ndarray]) -> list[str]:
+    """Names of arrays with a number that is NaN or infinite where it must not be.
 
-    Raises CheckpointError if there is none.
+    Networks, optimisers and running statistics must be finite. Worlds (`episodes`) need not: the return of the last episode
+    is NaN before the first, and a world may be kept for replay as it turned non-finite.
     """
-    wrong = []
-    for path in reversed(found(run_dir / "checkpoints")):
-        try:
-            state = load(path, config)
-        except DamagedError as reason:
-            wrong.append(str(reason))
-            continue
-        for each in wrong:
-            print(f"warning: {each}; falling back to {path.name}", file=sys.stderr)
-        return state, path
-    raise CheckpointError("; ".join(wrong) or f"{run_dir}: must hold a checkpoint; checkpoints/ has none")
+    learnt = (name for name, x in arrays.items() if jnp.issubdtype(x.dtype, jnp.inexact) and not name.startswith("episodes."))
+    return [name for name in learnt if not np.isfinite(arrays[name]).all()]
 
 
-def at(run_dir: Path, steps: int, config: Config) -> tuple[TrainState, Path]:
-    """The state after `steps` samples and its file; raises as `load`."""
-    path = run_dir / "checkpoints" / _name_of(steps)
-    return load(path, config), path
+def config_of(path: Path) -> Config:
+    """The configuration in a checkpoint; raises as `load`."""
+    with _body(path) as (file, size), _decoding(path):
+        unpacker = msgpack.Unpacker(file, max_buffer_size=size)
+        if (unpacker.read_map_header(), unpacker.unpack()) != (2, "arrays"):
+            raise ValueError
+        unpacker.skip()
+        if unpacker.unpack() != "config":
+            raise ValueError
+        text = unpacker.unpack()
+    try:
+        return from_dict(json.loads(text))
+    except ConfigError as reason:
+        raise CheckpointError(f"{path}: is of another version ({reason})") from reason
+    except (ValueError, TypeError, RecursionError) as reason:
+        raise DamagedError(f"{path}: is damaged (no configuration)") from reason
 
 
-def load(path: Path, config: Config) -> TrainState:
-    """The state saved at `path` by a run of `config`.
+def load(path: Path, like: T, *, part: bool = False) -> T:
+    """The tree of arrays saved at `path`, in which each is as `like` says (anything with shape and dtype).
 
-    Raises DamagedError if the file cannot be read whole, CheckpointError if it is of another run or a newer version.
+    With `part` the file may hold more than `like`. Raises DamagedError if the file cannot be read whole, CheckpointError if
+    an array is missing, unknown or of another type or shape, which is seen before it is decoded, NotFiniteError if it holds
+    NaN or infinity where `not_finite` says that it must not.
     """
-    saved, got = _read(path)
-    for name, (ours, theirs) in differences(config, saved).items():
-        if name not in MAY_CHANGE:
-            raise CheckpointError(f"{path}: is of another run, its {name} is {theirs}, here {ours}")
-    blank = jax.eval_shape(make_trainer(make_task(config), 1).init, config, seed_keys(config))
-    want = jax.eval_shape(_plain, blank)
-    for name in sorted(set(got) ^ set(want)):
-        raise CheckpointError(f"{path}: is of another run, {name} is {'unknown here' if name in got else 'missing'}")
-    for name, like in want.items():
-        kind = f"{got[name].dtype}{got[name].shape}"
-        if kind != f"{like.dtype}{like.shape}":
-            raise CheckpointError(f"{path}: is of another run, {name} is {kind}, here {like.dtype}{like.shape}")
-    for iteration in got["iteration"]:
-        if path.name != _name_of(int(iteration) * config.samples_per_iteration):
-            raise CheckpointError(f"{path}: is renamed, it was saved after {iteration} iterations")
+    want = jax.eval_shape(_plain, like)
+    with _body(path) as (file, size):
+        got = dict(_arrays(path, file, size, want, part))
+    for name in sorted(set(want) - set(got)):
+        raise CheckpointError(f"{path}: is of another run, {name} is missing")
+    for name in not_finite(got):
+        raise NotFiniteError(f"{path}: {name} is not finite: it can be neither continued nor evaluated")
 
-    def restored(path, like):
-        leaf = jnp.asarray(got[_name(path)])
+    def restored(at, like):
+        leaf = jnp.asarray(got[_name(at)])
         return jax.random.wrap_key_data(leaf) if _is_key(like) else leaf
 
-    return jax.tree.map_with_path(restored, blank)
+    return jax.tree.map_with_path(restored, like)
 
 
-def _read(path: Path) -> tuple[Config, dict[str, np.ndarray]]:
-    """Configuration, and arrays by name. Nothing in the file is ever run, and only bytes that match their checksum are decoded."""
+def _arrays(path: Path, file: BinaryIO, size: int, want: dict[str, Any], part: bool) -> Iterator[tuple[str, np.ndarray]]:
+    """Arrays by name. Containers and whatever is not expected are refused before they take memory."""
+    with _decoding(path):
+        unpacker = msgpack.Unpacker(file, max_buffer_size=size, max_array_len=0, max_map_len=0)
+        if (unpacker.read_map_header(), unpacker.unpack()) != (2, "arrays"):
+            raise ValueError
+        count = unpacker.read_map_header()
+    for _ in range(count):
+        with _decoding(path):
+            name = unpacker.unpack()
+            if not isinstance(name, str):
+                raise ValueError
+            if name not in want and part:
+                unpacker.skip()
+                continue
+        if name not in want:
+            raise CheckpointError(f"{path}: is of another run, {name[:200]} is unknown here")
+        with _decoding(path):
+            packed = unpacker.unpack()
+            if not isinstance(packed, msgpack.ExtType) or packed.code != ARRAY:
+                raise ValueError
+        yield name, _array(path, name, packed.data, want[name])
+
+
+def _array(path: Path, name: str, packed: bytes, like: Any) -> np.ndarray:
+    """One array, whose type and shape are compared before its bytes become numbers."""
+    with _decoding(path):
+        unpacker = msgpack.Unpacker(max_buffer_size=len(packed), max_array_len=0, max_map_len=0)
+        unpacker.feed(packed)
+        if unpacker.read_array_header() != 3 or (axes := unpacker.read_array_header()) > 32:
+            raise ValueError
+        shape, dtype = tuple(unpacker.unpack() for _ in range(axes)), unpacker.unpack()
+        if not all(type(n) is int for n in shape) or not isinstance(dtype, str):
+            raise ValueError
+    if (shape, dtype) != (like.shape, like.dtype.name):
+        raise CheckpointError(f"{path}: is of another run, {name} is {dtype[:20]}{shape}, here {like.dtype}{like.shape}")
+    with _decoding(path):
+        return np.frombuffer(unpacker.unpack(), like.dtype).reshape(like.shape)
+
+
+@contextmanager
+def _body(path: Path) -> Iterator[tuple[BinaryIO, int]]:
+    """The file behind its header, and its size, if schema and checksum are right."""
     try:
-        first, _, body = path.read_bytes().partition(b"\n")
+        with path.open("rb") as file:
+            checksum = _header(path, file.readline(4096))
+            start = file.tell()
+            if hashlib.file_digest(file, "sha256").hexdigest() != checksum:  # pyright: ignore[reportArgumentType]
+                raise DamagedError(f"{path}: is damaged (its checksum differs)")
+            size = file.tell()
+            file.seek(start)
+            yield file, size
     except OSError as reason:
         raise DamagedError(f"{path}: cannot be read ({reason.strerror})") from reason
+
+
+def _header(path: Path, line: bytes) -> str:
+    """The checksum."""
     try:
-        header = json.loads(first)
+        header = json.loads(line)
         schema, checksum = header["schema"], header["sha256"]
     except (ValueError, TypeError, KeyError, RecursionError):
         raise DamagedError(f"{path}: is damaged (no header)") from None
     if type(schema) is not int:
         raise DamagedError(f"{path}: is damaged (no schema)")
-    if schema != SCHEMA:
-        raise CheckpointError(f"{path}: has schema {schema}; this version reads schema {SCHEMA}")
-    if hashlib.sha256(body).hexdigest() != checksum:
-        raise DamagedError(f"{path}: is damaged (its checksum differs)")
+    if schema < SCHEMA:
+        renamed = "what it calls physics mjx is now called jax; continue it with the version that wrote it, or train again"
+        raise CheckpointError(f"{path}: has schema {schema}, this version reads schema {SCHEMA}: {renamed}")
+    if schema > SCHEMA:
+        raise CheckpointError(f"{path}: has schema {schema}, of a newer version; this version reads schema {SCHEMA}")
+    return checksum
+
+
+@contextmanager
+def _decoding(path: Path) -> Iterator[None]:
+    """A hostile file may carry a valid checksum, and the decoder raises many kinds."""
     try:
-        parts = serialization.msgpack_restore(body)
-        arrays = {str(name): np.asarray(array) for name, array in parts["arrays"].items()}
-        return from_dict(json.loads(str(parts["config"]))), arrays
-    except ConfigError as reason:
-        raise CheckpointError(f"{path}: is of another version ({reason})") from reason
-    except Exception as reason:  # a hostile file may carry a valid checksum; the decoder raises many kinds
+        yield
+    except OSError:
+        raise
+    except Exception as reason:
         raise DamagedError(f"{path}: is damaged ({type(reason).__name__})") from reason
 
 
-def _is_key(x) -> bool:
+def _is_key(x: Any) -> bool:
     return jnp.issubdtype(x.dtype, jax.dtypes.prng_key)
 
 
-def _plain(state: TrainState) -> dict[str, jax.Array]:
-    """The state's arrays by name; keys as the numbers they are made of."""
-    return {_name(path): jax.random.key_data(x) if _is_key(x) else x for path, x in jax.tree.leaves_with_path(state)}
+def _plain(tree: Any) -> dict[str, Any]:
+    """The tree's arrays by name; keys as the numbers they are made of."""
+    return {_name(path): jax.random.key_data(x) if _is_key(x) else x for path, x in jax.tree.leaves_with_path(tree)}
 
 
 def _name(path) -> str:

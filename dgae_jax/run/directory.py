@@ -4,10 +4,14 @@
 """
 
 import contextlib
+import errno
 import fcntl
+import glob
 import json
+import os
+import shutil
 import stat
-import sys
+import tempfile
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -15,7 +19,7 @@ from pathlib import Path
 from dgae_jax.configs.config import Config, ConfigError
 from dgae_jax.configs.serial import from_dict, to_dict
 from dgae_jax.configs.validation import validate
-from dgae_jax.run import files, manifest
+from dgae_jax.run import files, manifest, terminal
 from dgae_jax.run.options import RunOptions
 
 
@@ -25,18 +29,86 @@ def default_path(config: Config) -> Path:
 
 
 def create(path: Path, config: Config, options: RunOptions) -> None:
-    """Make a new run directory and write what the run is.
+    """Make a new run directory, whole at once, and write what the run is.
 
-    Raises ConfigError, and writes nothing, if the directory holds anything already or cannot be written.
+    It is built beside, hidden, and moved to its place in one step; what earlier attempts that were killed left there is removed.
+    In a directory that exists and is empty `config.json` is written last: without it the directory still counts as empty.
+    Raises ConfigError, and writes nothing, if the directory holds anything else or cannot be written.
     """
+    refusal = ConfigError(f"--run-dir {path}: must be a new or empty directory")
     try:
-        if path.exists() and (not path.is_dir() or any(path.iterdir())):
-            raise ConfigError(f"--run-dir {path}: must be a new or empty directory")
-        (path / "checkpoints").mkdir(parents=True)
-        write_config(path, config)
-        manifest.write(path, options)
+        if path.exists():
+            if not _is_empty(path):
+                raise refusal
+            _fill(path, config, options)
+            return
+        path.parent.mkdir(parents=True, exist_ok=True)
+        _clean(path)
+        with _sibling(path) as sibling:
+            _fill(sibling, config, options)
+            sibling.rename(path)
+        files.sync_directory(path.parent)
     except OSError as reason:
+        if reason.errno in (errno.ENOTEMPTY, errno.EEXIST):  # another process was quicker
+            raise refusal from reason
         raise ConfigError(f"--run-dir {path}: must be a directory that can be written ({reason.strerror})") from reason
+
+
+def has_begun(path: Path) -> bool:
+    """Whether a run was made at `path`, so that it can be resumed."""
+    return (path / "config.json").exists()
+
+
+def _is_empty(path: Path) -> bool:
+    """Whether there is nothing but what `_fill` leaves when it is killed."""
+    return path.is_dir() and all(
+        each.name in ("manifest.json", "manifest.json.part", "config.json.part")
+        or (each.name == "checkpoints" and each.is_dir() and not each.is_symlink() and not any(each.iterdir()))
+        for each in path.iterdir()
+    )
+
+
+def _fill(path: Path, config: Config, options: RunOptions) -> None:
+    (path / "checkpoints").mkdir(exist_ok=True)
+    manifest.write(path, options)
+    write_config(path, config)
+
+
+@contextlib.contextmanager
+def _sibling(path: Path) -> Iterator[Path]:
+    """A hidden directory beside `path`, locked while it is filled, and gone afterwards if it was not moved."""
+    made = Path(tempfile.mkdtemp(prefix=f".{path.name}.", suffix=".part", dir=path.parent))
+    with _held(made):
+        try:
+            made.chmod(0o777 & ~_umask())
+            yield made
+        finally:
+            shutil.rmtree(made, ignore_errors=True)
+
+
+def _clean(path: Path) -> None:
+    """Remove the siblings that no process holds any more."""
+    for left in path.parent.glob(f".{glob.escape(path.name)}.*.part"):
+        with contextlib.suppress(OSError), _held(left):
+            shutil.rmtree(left)
+
+
+@contextlib.contextmanager
+def _held(path: Path) -> Iterator[None]:
+    """Lock a directory; raises OSError if another process holds it, or if there are no locks here."""
+    descriptor = os.open(path, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW)
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        yield
+    finally:
+        os.close(descriptor)
+
+
+def _umask() -> int:
+    """Of this process, which can only be seen by setting it."""
+    mask = os.umask(0o077)
+    os.umask(mask)
+    return mask
 
 
 @contextlib.contextmanager
@@ -57,7 +129,7 @@ def _lock(file) -> None:
     except BlockingIOError:
         raise ConfigError(f"{Path(file.name).parent}: must not be in use; another process is training there") from None
     except OSError as reason:  # some network file systems have no locks
-        print(f"warning: {file.name} cannot be locked ({reason.strerror}): train in it with one process only", file=sys.stderr)
+        terminal.warn(f"warning: {file.name} cannot be locked ({reason.strerror}): train in it with one process only")
 
 
 def read_config(path: Path) -> Config:

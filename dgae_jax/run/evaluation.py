@@ -1,121 +1,132 @@
-"""What a trained policy is worth: episodes of its mean action in one of three engines."""
+"""What a trained policy is worth: episodes of its mean action in one of several engines."""
 
-import contextlib
 import dataclasses
 import warnings
-from collections import Counter
+from collections.abc import Callable
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
-from dgae_jax.configs.build import make_greedy, make_task
+from dgae_jax.configs.build import Fitted, Trainer, make_greedy, make_task, make_trainer
 from dgae_jax.configs.config import Config, ConfigError
-from dgae_jax.envs.registry import BRAX, TASKS
-from dgae_jax.learn.rollout import evaluate
-from dgae_jax.learn.types import TrainState
-from dgae_jax.run import checkpoint, files
+from dgae_jax.envs.registry import BRAX, PHYSICS, TASKS
+from dgae_jax.learn import play
+from dgae_jax.run import restore
+from dgae_jax.run.compiling import Watch, compile_aside, unwatched
+from dgae_jax.run.summary import over_seeds, summary
 
-ENGINES = ("gymnasium", "native", "jax")
-
-
-def evaluate_state(state: TrainState, config: Config, *, engine: str, episodes: int, seed: int = 0) -> dict[str, Any]:
-    """Undiscounted returns of every run in `state`; mean and standard deviation are over all their episodes."""
-    if config.env.startswith(BRAX) and engine != "jax":
-        raise ConfigError(f"--engine {engine}: must be jax with an environment of Brax's own ({config.env})")
-    run = _in_gymnasium if engine == "gymnasium" else _in_jax
-    states = [jax.tree.map(lambda x, i=i: x[i], state) for i in range(config.num_seeds)]
-    per_run = [run(one, config, engine, episodes, seed) for one in states]
-    return {
-        "engine": engine,
-        "env": referee(config),
-        "episodes": episodes * config.num_seeds,
-        **_summary(np.concatenate(per_run)),
-        "seeds": [{"seed": config.seed + i, **_summary(returns)} for i, returns in enumerate(per_run)],
-    }
+CHUNK = 50
+"""Steps between looks at signals and clock."""
 
 
-def evaluate_run(run_dir: Path, config: Config, *, which: str, engine: str, episodes: int, seed: int = 0) -> dict[str, Any]:
-    """`evaluate_state` for a run's newest checkpoint or the best of its evaluations.
-
-    Raises ConfigError if the best is asked for and nothing was evaluated.
-    """
-    if which == "newest":
-        state, path = checkpoint.newest(run_dir, config)
-    else:
-        steps = EvaluationsFile(run_dir / "evaluations.jsonl").best
-        if steps is None:
-            raise ConfigError(f"--checkpoint {which}: must be newest: {run_dir} has no evaluations")
-        state, path = checkpoint.at(run_dir, steps, config)
-    return {**evaluate_state(state, config, engine=engine, episodes=episodes, seed=seed), "checkpoint": path.name}
-
-
-class EvaluationsFile:
-    """`evaluations.jsonl`: one row per run and evaluation."""
-
-    def __init__(self, path: Path):
-        self.path = path
-        self.rows: list[dict[str, Any]] = []
-        with contextlib.suppress(OSError):
-            self.rows = [row for row, _ in files.whole_rows(path) if _is_evaluation(row)]
-
-    def cut(self, steps: int, runs: int) -> None:
-        """Forget what followed the first `steps` samples, and evaluations that lack some of the `runs`."""
-        rows_at = Counter(row["steps"] for row in self.rows)
-        self.rows = [row for row in self.rows if row["steps"] <= steps and rows_at[row["steps"]] == runs]
-        files.replace(self.path, files.json_lines(self.rows))
-
-    def has(self, steps: int) -> bool:
-        """Whether the state after `steps` samples was evaluated."""
-        return any(row["steps"] == steps for row in self.rows)
-
-    def append(self, steps: int, result: dict[str, Any]) -> None:
-        """Note the result of `evaluate_state` after `steps` samples."""
-        rows = [{"steps": steps, **{k: one[k] for k in ("seed", "return_mean", "return_std")}} for one in result["seeds"]]
-        files.append_rows(self.path, rows)
-        self.rows += rows
-
-    def points(self) -> np.ndarray:
-        """Steps, mean and standard deviation of every row [E, 3]."""
-        return np.array([[row[name] for name in ("steps", "return_mean", "return_std")] for row in self.rows]).reshape(-1, 3)
-
-    @property
-    def best(self) -> int | None:
-        """Steps of the best evaluation, by the mean over all runs; the later of equal ones."""
-        steps, mean, _ = self.points().T
-        return max((int(at) for at in steps), key=lambda at: (mean[steps == at].mean(), at), default=None)
-
-
-def _is_evaluation(row: dict[str, Any]) -> bool:
-    """A file may hold anything."""
-    steps, *numbers = (row.get(name) for name in ("steps", "seed", "return_mean", "return_std"))
-    if not (type(steps) is int and 0 <= steps < 2**53 and all(isinstance(x, float | int) and abs(x) < 1e30 for x in numbers)):
-        return False
-    return row["return_std"] >= 0
+def engines_of(config: Config) -> tuple[str, ...]:
+    """Where a run can be evaluated, the referee first: Gymnasium for our tasks, the run's own physics for any other."""
+    return (config.physics,) if config.env.startswith(BRAX) else ("gymnasium", *PHYSICS)
 
 
 def referee(config: Config) -> str:
     """Gymnasium's name of the task, or Brax's."""
-    if config.env.startswith(BRAX):
-        return config.env
-    return f"{TASKS[config.env].NAME}-{config.env_version}"
+    return config.env if config.env.startswith(BRAX) else f"{TASKS[config.env].NAME}-{config.env_version}"
 
 
-def _summary(returns: np.ndarray) -> dict[str, Any]:
-    worst_first = np.sort(returns)
+def default_path(run_dir: Path, engine: str, which: str) -> Path:
+    """The file of an evaluation after training, one for each engine and choice of checkpoint."""
+    return run_dir / f"evaluation-{engine}{'' if which == 'newest' else f'-{which}'}.json"
 
-    def mean_of_worst(share: float) -> float:
-        return float(worst_first[: max(1, round(share * len(returns)))].mean())
 
+def episode_seeds(seed: int, episodes: int) -> np.ndarray:
+    """A number of 64 bits for each initial state [E]; no other `seed` has any of them, but by a chance of 2⁻⁶⁴ per pair."""
+    return np.array([np.random.SeedSequence((seed, i)).generate_state(1, np.uint64)[0] for i in range(episodes)])
+
+
+def evaluate_run(
+    run_dir: Path, config: Config, *, which: str, engine: str | None = None, episodes: int, seed: int = 0, watch: Watch = unwatched
+) -> dict[str, Any]:
+    """`evaluate_policies` for a run's newest checkpoint or the best of its evaluations; raises as it and `restore.trained`."""
+    _check_engine(config, engine)
+    found = restore.trained(run_dir, config, which)
+    result = evaluate_policies(found.policy, config, engine=engine, episodes=episodes, seed=seed, watch=watch)
+    return {**result, "checkpoint": found.path.name}
+
+
+def evaluate_policies(
+    policies: Fitted, config: Config, *, engine: str | None = None, episodes: int, seed: int = 0, watch: Watch = unwatched
+) -> dict[str, Any]:
+    """Undiscounted returns of the policies of a run, one per trained seed: `returns` are all of them, `seeds` each one's.
+
+    Every policy plays the same `episodes` initial states, which `seed` determines. `engine` is the first of `engines_of` unless
+    another is named; raises ConfigError if it is none of them. May be broken off: it comes back to Python every `CHUNK` steps.
+    """
+    _check_engine(config, engine)
+    engine = engine or engines_of(config)[0]
+    run = _in_gymnasium if engine == "gymnasium" else _in_jax
+    per_run, where = [], f"{referee(config)} ({engine})"
+    for i in range(config.num_seeds):
+        of = f", seed {config.seed + i}" if config.num_seeds > 1 else ""
+        one = jax.tree.map(lambda x, i=i: x[i], policies)
+        progress = _Progress(watch, f"evaluating {episodes} episodes in {where}{of}", config.episode_length)
+        per_run.append(run(one, config, engine, episodes, seed, progress))
     return {
-        "return_mean": float(returns.mean()),
-        "return_std": float(returns.std()),
-        "return_cvar": {str(share): mean_of_worst(share) for share in (0.05, 0.1, 0.25)},
-        "return_quantiles": {str(q): float(np.quantile(returns, q)) for q in (0.05, 0.25, 0.5, 0.75, 0.95)},
-        "returns": [round(float(r), 4) for r in returns],
+        "engine": engine,
+        "env": referee(config),
+        "episodes": episodes * config.num_seeds,
+        **summary(np.concatenate(per_run)),
+        **(over_seeds(per_run) if len(per_run) > 1 else {}),
+        "seeds": [{"seed": config.seed + i, **summary(returns)} for i, returns in enumerate(per_run)],
     }
+
+
+def _check_engine(config: Config, engine: str | None) -> None:
+    if engine is not None and engine not in engines_of(config):
+        raise ConfigError(f"--engine {engine}: must be one of {', '.join(engines_of(config))} with {config.env}")
+
+
+class _Progress(NamedTuple):
+    """Says how far an evaluation is."""
+
+    watch: Watch
+    what: str
+    limit: int
+
+    def __call__(self, step: int, alive: int) -> None:
+        self.watch(f"{self.what}: step {step:,} of at most {self.limit:,}, {alive} still running")
+
+
+@lru_cache(maxsize=1)
+def _programs(config: Config) -> tuple[Trainer, Callable[[Fitted, play.Play, int], play.Play]]:
+    """In the physics of `config`: the trainer, and `go_on(policy, episodes, until) -> episodes`."""
+    env = make_task(config)
+    greedy = make_greedy(env, config)
+    return make_trainer(env, 1), jax.jit(lambda policy, now, until: play.play(env, lambda obs: greedy(policy, obs), now, until))
+
+
+def _fresh_worlds(config: Config, seed: int, episodes: int, progress: _Progress) -> Any:
+    """Environment states at the beginning of an episode [E].
+
+    They are taken from fresh training states: a reset of Brax's takes half a minute to compile, and JAX's cache already has
+    this program, or will.
+    """
+    init = _programs(config)[0].init
+    batches = -(-episodes // (config.num_seeds * config.num_envs))
+    numbers = [np.random.SeedSequence((seed, i)).generate_state(config.num_seeds) for i in range(batches)]
+    keys = [jnp.stack([jax.random.key(int(n)) for n in each]) for each in numbers]
+    compile_aside(init, config, keys[0], watch=progress.watch, what=f"{progress.what}: compiling resets")
+    worlds = [jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), init(config, each).episodes.env) for each in keys]
+    return jax.tree.map(lambda *parts: jnp.concatenate(parts)[:episodes], *worlds)
+
+
+def _in_jax(policy: Fitted, config: Config, engine: str, episodes: int, seed: int, progress: _Progress) -> np.ndarray:
+    config = dataclasses.replace(config, physics=engine)
+    now, go_on = play.begin(_fresh_worlds(config, seed, episodes, progress)), _programs(config)[1]
+    compile_aside(go_on, policy, now, 1, watch=progress.watch, what=f"{progress.what}: compiling steps")
+    while (step := int(now.step)) < config.episode_length and (alive := int(now.alive.sum())):
+        progress(step, alive)
+        now = go_on(policy, now, min(step + CHUNK, config.episode_length))
+    return np.asarray(now.total, np.float64)
 
 
 @lru_cache(maxsize=1)
@@ -123,25 +134,7 @@ def _greedy(config: Config):
     return jax.jit(make_greedy(make_task(config), config))
 
 
-@lru_cache(maxsize=1)
-def _returns(config: Config, episodes: int):
-    """`returns(state, key) -> [E]` in the physics of `config`."""
-    env = make_task(config)
-    greedy = make_greedy(env, config)
-
-    @jax.jit
-    def returns(state: TrainState, key: jax.Array):
-        return evaluate(env, lambda obs: greedy(state, obs), key, episodes=episodes, episode_length=config.episode_length)
-
-    return returns
-
-
-def _in_jax(state: TrainState, config: Config, engine: str, episodes: int, seed: int) -> np.ndarray:
-    returns = _returns(dataclasses.replace(config, physics=engine), episodes)
-    return np.asarray(returns(state, jax.random.key(seed)), np.float64)
-
-
-def _in_gymnasium(state: TrainState, config: Config, engine: str, episodes: int, seed: int) -> np.ndarray:
+def _in_gymnasium(policy: Fitted, config: Config, engine: str, episodes: int, seed: int, progress: _Progress) -> np.ndarray:
     """Gymnasium's own task in C MuJoCo, the referee: episodes side by side, one batched policy call per step."""
     import gymnasium  # here, so that training alone does not import it
 
@@ -149,14 +142,19 @@ def _in_gymnasium(state: TrainState, config: Config, engine: str, episodes: int,
         warnings.simplefilter("ignore")  # that v4 is not the newest version is known
         worlds = [gymnasium.make(referee(config), max_episode_steps=config.episode_length) for _ in range(episodes)]
     greedy = _greedy(config)
-    obs = np.stack([world.reset(seed=seed + i)[0] for i, world in enumerate(worlds)])
-    total, alive = np.zeros(episodes), np.full(episodes, True)
+    starts = zip(episode_seeds(seed, episodes), worlds, strict=True)
+    obs = np.stack([world.reset(seed=int(number))[0] for number, world in starts])
+    compile_aside(greedy, policy, obs.astype(np.float32), watch=progress.watch, what=f"{progress.what}: compiling")
+    total, alive, step = np.zeros(episodes), np.full(episodes, True), 0
     while alive.any():
-        actions = np.asarray(greedy(state, obs.astype(np.float32)))
+        if step % CHUNK == 0:
+            progress(step, int(alive.sum()))
+        actions = np.asarray(greedy(policy, obs.astype(np.float32)))
         for i in np.flatnonzero(alive):
             obs[i], reward, terminated, truncated, _ = worlds[i].step(actions[i])
             total[i] += float(reward)
             alive[i] = not (terminated or truncated)
+        step += 1
     for world in worlds:
         world.close()
     return total

@@ -1,7 +1,9 @@
 """Files that are whole or not there, and files that grow line by line."""
 
 import contextlib
+import errno
 import json
+import math
 import os
 from collections.abc import Iterable, Iterator
 from pathlib import Path
@@ -19,18 +21,44 @@ def replace(path: Path, data: bytes) -> None:
                 file.flush()
                 os.fsync(file.fileno())
             part.replace(path)
+            sync_directory(path.parent)
         finally:
             part.unlink(missing_ok=True)
 
 
+def sync_directory(path: Path) -> None:
+    """The names in a directory are on the disk when this returns; a rename alone may be lost with the power."""
+    descriptor = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    except OSError as reason:
+        if reason.errno not in (errno.EINVAL, errno.ENOTSUP):  # some network file systems cannot
+            raise
+    finally:
+        os.close(descriptor)
+
+
 def write_json(path: Path, data: Any) -> None:
-    """Indented JSON, complete or not at all."""
-    replace(path, (json.dumps(data, indent=2) + "\n").encode())
+    """Indented JSON, complete or not at all; numbers that are not finite are null."""
+    replace(path, (_json(data, indent=2) + "\n").encode())
 
 
 def json_lines(rows: Iterable[dict[str, Any]]) -> bytes:
-    """One line of JSON per row."""
-    return "".join(json.dumps(row) + "\n" for row in rows).encode()
+    """One line of JSON per row; numbers that are not finite are null."""
+    return "".join(_json(row) + "\n" for row in rows).encode()
+
+
+def _json(data: Any, indent: int | None = None) -> str:
+    return json.dumps(_finite(data), indent=indent, allow_nan=False)
+
+
+def _finite(data: Any) -> Any:
+    """JSON has no word for NaN and infinity."""
+    if isinstance(data, dict):
+        return {name: _finite(value) for name, value in data.items()}
+    if isinstance(data, list | tuple):
+        return [_finite(value) for value in data]
+    return None if isinstance(data, float) and not math.isfinite(data) else data
 
 
 def append_rows(path: Path, rows: Iterable[dict[str, Any]]) -> None:

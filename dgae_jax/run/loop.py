@@ -1,56 +1,91 @@
-"""A run from its configuration to its evaluation, on disk."""
+"""A run from its configuration to its evaluation, on disk: started, resumed, or whichever of the two there is to do."""
 
-import contextlib
-import sys
-import time
+import dataclasses
+import os
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
-import numpy as np
-
-from dgae_jax.configs.build import make_task, make_trainer, seed_keys
 from dgae_jax.configs.config import Config, ConfigError, flag
 from dgae_jax.configs.serial import MAY_CHANGE, differences
 from dgae_jax.configs.validation import validate
 from dgae_jax.learn.types import TrainState
-from dgae_jax.run import checkpoint, directory, files, machine, manifest
-from dgae_jax.run.evaluation import EvaluationsFile
+from dgae_jax.run import checkpoint, compiling, directory, machine, manifest, restore, terminal
+from dgae_jax.run.evaluations import EvaluationsFile
 from dgae_jax.run.options import RunOptions, validate_options
-from dgae_jax.run.progress import Reporter
-from dgae_jax.run.record import Record
-from dgae_jax.run.signals import Signals, Stopped
-
-CAPACITY = 64
-"""Most iterations in one dispatch."""
-DISPATCH_SECONDS = 2.0
-"""Aim for the time between looks at metrics, clock and signals."""
+from dgae_jax.run.summary import describe
+from dgae_jax.run.training import RunError, run_to_end
 
 
-def train(config: Config, options: RunOptions) -> int:
-    """Train, evaluate, and write the run directory.
+class Finished(NamedTuple):
+    """A run that reached its end."""
 
-    Returns the process's exit code: 0, 1 if training broke down or nothing could be written any more, or 130 / 143 after a
-    signal. Raises ConfigError before anything is written or compiled if the configuration or a path cannot be.
+    evaluation: dict[str, Any]
+    """What `evaluation.json` holds."""
+    directory: Path
+
+
+def start(config: Config, options: RunOptions) -> Finished:
+    """Train, evaluate, and write a new run directory.
+
+    Raises ConfigError before anything is written or compiled if the configuration or a path is invalid, RunError if the run
+    ends early.
     """
     config = _prepared(config, options)
     run_dir = options.run_dir or directory.default_path(config)
     directory.create(run_dir, config, options)
     with directory.locked(run_dir):
-        return _run(config, options, run_dir, None)
+        return Finished(run_to_end(config, options, run_dir, None), run_dir)
 
 
-def resume(config: Config, options: RunOptions) -> int:
+def go_on(config: Config, options: RunOptions) -> Finished:
     """Continue the run in `options.resume` from its newest whole checkpoint, as if it had never stopped.
 
-    Returns as `train`. Raises ConfigError, naming both values, for a setting other than `total_steps` that differs from the
-    run's, or for another machine or version; CheckpointError if no checkpoint can be loaded.
+    Raises as `start`; ConfigError also, naming both values, for a setting other than `total_steps` that differs from the run's,
+    or for another machine or version; CheckpointError if no checkpoint can be loaded.
     """
     config = _prepared(config, options)
     run_dir = options.resume
     assert run_dir is not None
     _compare(config, directory.read_config(run_dir), run_dir, options.inexact)
     with directory.locked(run_dir):
-        return _run(config, options, run_dir, _last_state(run_dir, config))
+        return Finished(run_to_end(config, options, run_dir, _last_state(run_dir, config)), run_dir)
+
+
+def go_on_or_start(config: Config, options: RunOptions) -> Finished:
+    """`go_on` in `options.run_dir` if a run was begun there, `start` otherwise; raises as they do."""
+    validate_options(options)
+    if options.run_dir is not None and directory.has_begun(options.run_dir):
+        return go_on(config, dataclasses.replace(options, resume=options.run_dir, run_dir=None, resume_or_start=False))
+    return start(config, options)
+
+
+def train(config: Config, options: RunOptions) -> int:
+    """`start`, and the process's exit code: 0, 1 if it broke down, 130 / 143 / 129 after a signal."""
+    return _exit_code(start, config, options)
+
+
+def resume(config: Config, options: RunOptions) -> int:
+    """`go_on`, and the exit code as `train`."""
+    return _exit_code(go_on, config, options)
+
+
+def resume_or_start(config: Config, options: RunOptions) -> int:
+    """`go_on_or_start`, and the exit code as `train`."""
+    return _exit_code(go_on_or_start, config, options)
+
+
+def _exit_code(work: Callable[[Config, RunOptions], Finished], config: Config, options: RunOptions) -> int:
+    """Say how it went. Where XLA is left compiling the process ends here, since Python would wait for it."""
+    try:
+        finished = work(config, options)
+    except RunError as end:
+        (terminal.say if end.exit_code > 128 else terminal.warn)(str(end))
+        if compiling.is_running():
+            os._exit(end.exit_code)
+        return end.exit_code
+    terminal.say(f"{describe(finished.evaluation)}; files in {finished.directory}")
+    return 0
 
 
 def _prepared(config: Config, options: RunOptions) -> Config:
@@ -79,7 +114,7 @@ def _compare(config: Config, saved: Config, run_dir: Path, inexact: bool) -> Non
 
 
 def _warn_of_another_sample(reason: str) -> None:
-    print(f"warning: {reason}, so the rest is another sample", file=sys.stderr)
+    terminal.warn(f"warning: {reason}, so the rest is another sample")
 
 
 def _last_state(run_dir: Path, config: Config) -> TrainState | None:
@@ -87,106 +122,11 @@ def _last_state(run_dir: Path, config: Config) -> TrainState | None:
     if not checkpoint.found(run_dir / "checkpoints"):
         if EvaluationsFile(run_dir / "evaluations.jsonl").rows:
             raise ConfigError(f"{run_dir}: must hold a checkpoint; it had some when it was evaluated, checkpoints/ has none")
-        print(f"{run_dir} has no checkpoint yet: it starts again")
+        terminal.say(f"{run_dir} has no checkpoint yet: it starts again")
         return None
-    state, path = checkpoint.newest(run_dir, config)
+    state, path = restore.training_state(run_dir, config)
     done = config.samples_per_iteration * int(state.iteration[0])
     if config.total_steps < done:
         raise ConfigError(f"--total-steps {config.total_steps}: must be at least the {done} that are done in {run_dir}")
-    print(f"resuming from {path.name}")
+    terminal.say(f"resuming from {path.name}")
     return state
-
-
-def _run(config: Config, options: RunOptions, run_dir: Path, state: TrainState | None) -> int:
-    print(_budget(config), flush=True)
-    done = 0 if state is None else int(state.iteration[0])
-    with Signals() as signals:
-        try:
-            with Record(run_dir, config, options, done) as record:
-                if options.resume:
-                    directory.write_config(run_dir, config)
-                    manifest.add(run_dir, options)
-                state = _iterate(config, options, record, signals, state)
-                if _broken(state, options):
-                    return _broke_down(state, run_dir)
-                with signals.may_stop():
-                    result = record.evaluate(state)
-            files.write_json(run_dir / "evaluation.json", result)
-        except Stopped:
-            print(f"stopped by {signals.name}; continue with --resume {run_dir}", flush=True)
-            return signals.exit_code
-        except OSError as reason:
-            return _cannot_write(reason, run_dir)
-    print(f"{describe(result)}; files in {run_dir}", flush=True)
-    return 0
-
-
-def _iterate(config: Config, options: RunOptions, record: Record, signals: Signals, state: TrainState | None) -> TrainState:
-    """All iterations that are left, dispatch by dispatch, until the budget is used, a signal came, or it broke down."""
-    every = max(1, options.checkpoint_every // config.samples_per_iteration)
-    done, count, compiled = record.metrics.iteration, 1, False
-    if state is not None and done == config.iterations:
-        return state
-    trainer = make_trainer(make_task(config), CAPACITY)
-    with Reporter(config.iterations * config.samples_per_iteration, config.num_seeds) as reporter:
-        if state is None:
-            state = trainer.init(config, seed_keys(config))
-        elif done % every == 0:
-            _look(record, state, signals)  # unless it was evaluated before it stopped
-        while done < config.iterations and not (signals.received and compiled):
-            count = min(count, config.iterations - done, every - done % every)
-            since = time.monotonic()
-            state, measured = trainer.dispatch(config, state, count)
-            mean_return = record.append(state, measured, count)
-            seconds, done = (time.monotonic() - since) / count, done + count
-            if compiled:  # the first dispatch says nothing about speed
-                reporter.update(done * config.samples_per_iteration, config.samples_per_iteration / seconds, mean_return)
-            count = int(np.clip(DISPATCH_SECONDS / seconds, 1, CAPACITY)) if compiled else 1
-            compiled, broken, due = True, _broken(state, options), done % every == 0
-            if due or done == config.iterations or signals.received or broken:
-                record.save(state)
-                record.draw()
-            if broken:
-                break
-            if due and done < config.iterations:
-                _look(record, state, signals)
-    return state
-
-
-def _look(record: Record, state: TrainState, signals: Signals) -> None:
-    """Evaluate on the way, unless a signal came: a run that goes on later makes up for it."""
-    if not record.evaluated:
-        with contextlib.suppress(Stopped), signals.may_stop():
-            record.evaluate(state)
-
-
-def _broken(state: TrainState, options: RunOptions) -> bool:
-    return int(state.failures.max()) >= options.max_nonfinite
-
-
-def _broke_down(state: TrainState, run_dir: Path) -> int:
-    reason = f"the last {int(state.failures.max())} updates were not finite and were left out"
-    print(f"stopped: {reason}; the state before them is in {run_dir}", file=sys.stderr)
-    return 1
-
-
-def _cannot_write(reason: OSError, run_dir: Path) -> int:
-    saved = checkpoint.found(run_dir / "checkpoints")
-    left = f"continue from {saved[-1].name} with --resume {run_dir}" if saved else "there is no checkpoint"
-    print(f"stopped: {reason.filename or 'output'}: cannot be written ({reason.strerror}); {left}", file=sys.stderr)
-    return 1
-
-
-def _budget(config: Config) -> str:
-    runs, samples = f" × {config.num_seeds} seeds" if config.num_seeds > 1 else "", config.samples_per_iteration
-    used = f"{config.iterations:,} iterations × {samples:,} samples = {config.iterations * samples:,}"
-    task = config.env if config.env_version is None else f"{config.env}-{config.env_version}"
-    return f"{task} {config.algo} on {config.physics}: {used} of {config.total_steps:,} steps{runs}"
-
-
-def describe(result: dict[str, Any]) -> str:
-    """An evaluation in one line."""
-    return (
-        f"return {result['return_mean']:,.1f} ± {result['return_std']:,.1f} over {result['episodes']} episodes"
-        f" of the deterministic policy in {result['env']} ({result['engine']})"
-    )

@@ -1,26 +1,26 @@
 """The machine a run is on."""
 
 import os
-import sys
 from pathlib import Path
 
 import jax
 
 from dgae_jax.configs.config import Config, ConfigError
+from dgae_jax.run import terminal
 
 
 def use_device(config: Config) -> None:
     """Start JAX on its device; raises ConfigError if there is none of the kind asked for."""
     try:
         platform = jax.devices()[0].platform
-    except RuntimeError as reason:
-        wanted = os.environ.get("JAX_PLATFORMS", "")
-        raise ConfigError(f"JAX_PLATFORMS={wanted}: must name a device that JAX finds here, cpu for one ({reason})") from reason
+    except Exception as reason:  # JAX raises many kinds, an AssertionError without a word for a missing plugin
+        wanted, why = os.environ.get("JAX_PLATFORMS", ""), str(reason) or type(reason).__name__
+        gpu = "" if wanted == "cpu" else 'an NVIDIA GPU needs pip install "dgae_jax[cuda13]"; '
+        raise ConfigError(f"JAX_PLATFORMS={wanted}: must name a device that JAX finds here, cpu for one; {gpu}JAX says: {why}") from reason
     if config.physics == "native" and platform != "cpu":
-        print(
+        terminal.warn(
             f"warning: --physics native simulates on the CPU and everything else runs on the {platform}, so that each step crosses"
-            f" between them; --physics jax or JAX_PLATFORMS=cpu keeps all in one place",
-            file=sys.stderr,
+            f" between them; --physics jax or JAX_PLATFORMS=cpu keeps all in one place"
         )
 
 

@@ -21,6 +21,8 @@ class RunOptions:
     """The newest checkpoints that are kept, beside the one with the best evaluation [files]."""
     resume: Path | None = None
     """Continue the run in this directory, bit for bit, with its flags where none are given [path]."""
+    resume_or_start: bool = False
+    """Continue the run in --run-dir if there is one, otherwise start it there: one command for schedulers that requeue."""
     inexact: bool = False
     """Let --resume continue with another --physics, device, number of cores or versions: the same in the statistical sense only."""
     max_nonfinite: int = 10
@@ -39,7 +41,11 @@ def validate_options(options: RunOptions) -> None:
             raise ConfigError(f"{flag(name)} {value}: must be a whole number of at least 1")
     if options.resume is not None and options.run_dir is not None:
         raise ConfigError(f"--run-dir {options.run_dir}: must be left out: --resume writes to {options.resume}")
-    if options.resume is None and options.inexact:
+    if options.resume is not None and options.resume_or_start:
+        raise ConfigError("--resume-or-start True: must be left out: --resume only resumes")
+    if options.resume_or_start and options.run_dir is None:
+        raise ConfigError("--resume-or-start True: must come with the directory to look in, --run-dir DIR")
+    if options.inexact and options.resume is None and not options.resume_or_start:
         raise ConfigError("--inexact True: must be left out without --resume")
 
 

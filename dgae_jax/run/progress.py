@@ -3,27 +3,44 @@
 import sys
 import time
 
+from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn
+
+from dgae_jax.run import terminal
 
 PLAIN_EVERY = 10.0
 """Seconds between plain lines."""
 
 
 class Reporter:
-    """Shows samples, samples per second over all seeds, the mean return, and the time left."""
+    """Shows samples, samples per second over all seeds, the mean return, and the time left; or whatever else takes time."""
 
-    def __init__(self, total: int, runs: int):
+    def __init__(self, total: int = 0, runs: int = 1):
         self.total, self.runs = total, runs
-        self.began = self.printed = time.monotonic()
-        self.bar = Progress(BarColumn(None), TextColumn("{task.description}")) if sys.stdout.isatty() else None
-        if self.bar:
-            self.bar.start()
-            self.task = self.bar.add_task("compiling", total=total)
-        else:
-            print("compiling", flush=True)
+        self.printed = time.monotonic()
+        self.bar = None
+        if terminal.is_live():
+            console = Console(file=terminal.Steady(sys.stdout))
+            self.bar = Progress(BarColumn(None), TextColumn("{task.description}"), console=console, transient=not total)
+            self.task = self.bar.add_task("", total=total or None)
 
     def __enter__(self) -> "Reporter":
+        if self.bar:
+            self.bar.start()
         return self
+
+    def announce(self, text: str) -> None:
+        """A line that is printed whatever was printed last; on a terminal the bar says it."""
+        if not self.bar:
+            self.printed = time.monotonic()
+            terminal.say(text)
+
+    def watch(self, text: str) -> None:
+        """What is going on: the bar's text, or a line every ten seconds."""
+        if self.bar:
+            self.bar.update(self.task, description=text)
+        elif time.monotonic() - self.printed >= PLAIN_EVERY:
+            self.announce(text)
 
     def update(self, steps: int, speed: float, mean_return: float | None) -> None:
         """`speed` in samples of one run per second; returns may not exist yet."""
@@ -31,10 +48,8 @@ class Reporter:
         shown = "–" if mean_return is None else f"{mean_return:,.1f}"
         text = f"{steps:,} of {self.total:,} steps  {speed * self.runs:,.0f} steps/s  return {shown}  {_clock(left)} left"
         if self.bar:
-            self.bar.update(self.task, completed=steps, description=text)
-        elif steps >= self.total or time.monotonic() - self.printed >= PLAIN_EVERY:
-            self.printed = time.monotonic()
-            print(text, flush=True)
+            self.bar.update(self.task, completed=steps)
+        (self.announce if steps >= self.total and not self.bar else self.watch)(text)
 
     def __exit__(self, *_) -> None:
         if self.bar:

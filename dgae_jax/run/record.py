@@ -10,12 +10,14 @@ from typing import Any
 import jax
 import numpy as np
 
+from dgae_jax.configs.build import Fitted
 from dgae_jax.configs.config import Config
-from dgae_jax.envs.registry import BRAX
 from dgae_jax.learn.types import TrainState
 from dgae_jax.physics.engine import PhysicsState
 from dgae_jax.run import checkpoint, curve
-from dgae_jax.run.evaluation import EvaluationsFile, evaluate_state
+from dgae_jax.run.compiling import Watch
+from dgae_jax.run.evaluation import evaluate_policies
+from dgae_jax.run.evaluations import EvaluationsFile
 from dgae_jax.run.metrics import MetricsFile
 from dgae_jax.run.options import RunOptions
 from dgae_jax.run.signals import Stopped
@@ -72,10 +74,9 @@ class Record:
         keep = self.options.keep_checkpoints, self.evaluations.best
         self._write(checkpoint.save, self.run_dir / "checkpoints", self.config, checkpoint.arrays_of(state), self.steps, *keep)
 
-    def evaluate(self, state: TrainState) -> dict[str, Any]:
+    def evaluate(self, policies: Fitted, watch: Watch) -> dict[str, Any]:
         """Returns of the policies as they are now, noted and drawn."""
-        engine = "jax" if self.config.env.startswith(BRAX) else "gymnasium"
-        result = evaluate_state(state, self.config, engine=engine, episodes=self.options.episodes)
+        result = evaluate_policies(policies, self.config, episodes=self.options.episodes, watch=watch)
         if not self.evaluated:
             self.evaluations.append(self.steps, result)
         self.draw()

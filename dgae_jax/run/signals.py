@@ -3,8 +3,12 @@
 import contextlib
 import os
 import signal
+import threading
 from collections.abc import Iterator
 from typing import Any
+
+KINDS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+"""Ctrl-C, a scheduler, and a terminal that was closed."""
 
 
 class Stopped(Exception):
@@ -12,7 +16,11 @@ class Stopped(Exception):
 
 
 class Signals:
-    """Notes the first SIGINT or SIGTERM, so that the running dispatch can finish; a second one ends the process at once."""
+    """Notes the first signal, so that the running dispatch can finish; a second one ends the process at once.
+
+    A second SIGHUP does not: a terminal that closes may send several, and systemd sends one after SIGTERM. SIGHUP stays
+    ignored where it was (`nohup`). Outside of the main thread Python has no signals, and none are noted.
+    """
 
     def __init__(self):
         self.received: signal.Signals | None = None
@@ -20,7 +28,9 @@ class Signals:
         self.nothing_to_lose = False
 
     def __enter__(self) -> "Signals":
-        self.before = {kind: signal.signal(kind, self._note) for kind in (signal.SIGINT, signal.SIGTERM)}
+        if threading.current_thread() is threading.main_thread():
+            noted = [kind for kind in KINDS if kind != signal.SIGHUP or signal.getsignal(kind) != signal.SIG_IGN]
+            self.before = {kind: signal.signal(kind, self._note) for kind in noted}
         return self
 
     def __exit__(self, *_) -> None:
@@ -39,12 +49,12 @@ class Signals:
 
     @property
     def name(self) -> str:
-        """Of the signal that came, SIGINT or SIGTERM."""
+        """Of the signal that came: SIGINT, SIGTERM or SIGHUP."""
         return self.received.name if self.received else ""
 
     @property
     def exit_code(self) -> int:
-        """130 after SIGINT, 143 after SIGTERM."""
+        """130 after SIGINT, 143 after SIGTERM, 129 after SIGHUP."""
         return 128 + (self.received or 0)
 
     def _stop(self) -> None:
@@ -54,7 +64,7 @@ class Signals:
     def _note(self, kind: int, _) -> None:
         self.received = signal.Signals(kind)
         for each in self.before:
-            signal.signal(each, signal.SIG_DFL)
+            signal.signal(each, signal.SIG_IGN if each == signal.SIGHUP else signal.SIG_DFL)
         self._stop()
-        # no print: it may be what was interrupted
-        os.write(2, f"{self.name}: finishing what is running, then saving; a second signal ends it at once\n".encode())
+        with contextlib.suppress(OSError):  # no print: it may be what was interrupted
+            os.write(2, f"{self.name}: finishing what is running, then saving; a second signal ends it at once\n".encode())

@@ -1,0 +1,113 @@
+"""Runs from Python: train one, and take its policy out."""
+
+import contextlib
+import dataclasses
+import shutil
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+
+from dgae_jax.configs.build import Fitted, make_greedy, make_quantiles, make_task
+from dgae_jax.configs.config import Config, ConfigError, resolve
+from dgae_jax.run import directory, loop, metrics, restore, terminal
+from dgae_jax.run.options import RunOptions
+from dgae_jax.run.training import RunError
+
+
+class Policy:
+    """A trained policy: its mean action, and what its critic thinks. NumPy in and out."""
+
+    def __init__(self, policy: Fitted, critic: Fitted, config: Config):
+        """`policy` and `critic` of one run, without the axis of runs."""
+        env = make_task(config)
+        self.observation_size = int(env.observation_size)  # pyright: ignore[reportArgumentType]
+        self._policy, self._critic = policy, critic
+        self._greedy, self._quantiles = jax.jit(make_greedy(env, config)), jax.jit(make_quantiles(env, config))
+
+    def __call__(self, obs: Any) -> np.ndarray:
+        """The action [..., A] in each observation [..., O]: the mean, within the actuators' range, as evaluations play it.
+
+        Raises ValueError if the last axis is not that of an observation.
+        """
+        return self._each(self._greedy, self._policy, obs)
+
+    def quantiles(self, obs: Any) -> np.ndarray:
+        """The critic's quantiles [..., K] of the discounted return from each observation [..., O], K = 1 for a scalar critic.
+
+        They are in the units that the critic was trained in: returns of scaled rewards with `normalize_rewards`.
+        """
+        return self._each(self._quantiles, self._critic, obs)
+
+    def _each(self, function: Any, network: Fitted, obs: Any) -> np.ndarray:
+        """Leading axes are one to the compiled program, so that it is compiled again for another number of observations only."""
+        obs = np.asarray(obs, np.float32)
+        if obs.ndim == 0 or obs.shape[-1] != self.observation_size:
+            raise ValueError(f"observations of shape {obs.shape}; the last axis must be {self.observation_size}")
+        out = np.asarray(function(network, obs.reshape(-1, self.observation_size)))
+        return out.reshape(*obs.shape[:-1], out.shape[-1])
+
+
+class Run(NamedTuple):
+    """A finished run."""
+
+    policy: Policy
+    """The last policy, of the first seed."""
+    metrics: list[dict[str, Any]]
+    """The rows of `metrics.jsonl`: one per iteration and seed."""
+    evaluation: dict[str, Any]
+    """What `evaluation.json` holds."""
+    directory: Path | None
+    """The run directory, None if it was temporary."""
+
+
+def train(config: Config, run_dir: str | Path | None = None, *, quiet: bool = False, **options: Any) -> Run:
+    """Train, evaluate and return the whole of a run, as the command line does.
+
+    Without `run_dir` it is written to a temporary directory and removed at the end. `options` are fields of `RunOptions`
+    (`episodes=5`, `checkpoint_every=50_000`, `resume_or_start=True`, …); `quiet` prints nothing but warnings. Raises
+    ConfigError for an invalid setting before anything is written, and RunError if the run ends early, by a signal too: its
+    message says how to go on, from a directory that stays, even a temporary one.
+    """
+    names = [f.name for f in dataclasses.fields(RunOptions) if f.name not in ("run_dir", "resume")]
+    for name in options:
+        if name not in names:
+            raise ConfigError(f"{name}: must be one of {', '.join(names)}")
+    with terminal.silenced(quiet), _directory(run_dir) as path:
+        chosen = RunOptions(run_dir=path, **options)
+        evaluation = (loop.go_on_or_start if chosen.resume_or_start else loop.start)(config, chosen).evaluation
+        return Run(load_policy(path), metrics.read(path / "metrics.jsonl"), evaluation, None if run_dir is None else path)
+
+
+def load_policy(run_dir: str | Path, which: str = "newest", *, seed: int = 0) -> Policy:
+    """The policy of a run's newest checkpoint, or of its best evaluation's (`which="best"`).
+
+    `seed` is the index among the seeds trained side by side (`num_seeds`). Only networks and observation statistics are read.
+    Raises ConfigError for an invalid argument or a directory that holds no run, CheckpointError if no checkpoint can be read.
+    """
+    config = resolve(directory.read_config(Path(run_dir)))
+    if not (type(seed) is int and 0 <= seed < config.num_seeds):
+        raise ConfigError(f"seed {seed}: must be a whole number from 0 to {config.num_seeds - 1}, the index of a trained seed")
+    found = restore.trained(Path(run_dir), config, which)
+    policy, critic = jax.tree.map(lambda x: x[seed], (found.policy, found.critic))
+    return Policy(policy, critic, config)
+
+
+@contextlib.contextmanager
+def _directory(run_dir: str | Path | None) -> Iterator[Path]:
+    """`run_dir`, or a temporary directory that stays only if the run can be continued in it."""
+    if run_dir is not None:
+        yield Path(run_dir)
+        return
+    made = tempfile.mkdtemp(prefix="dgae_jax-")
+    try:
+        yield Path(made)
+    except RunError:
+        raise
+    except BaseException:
+        shutil.rmtree(made, ignore_errors=True)
+        raise
+    shutil.rmtree(made, ignore_errors=True)

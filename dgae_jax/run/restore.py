@@ -1,0 +1,101 @@
+"""From the checkpoints of a run directory to a training state or to what acting takes of one."""
+
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from typing import Any, NamedTuple, TypeVar
+
+import jax
+
+from dgae_jax.configs.build import Fitted, make_task, make_trainer, seed_keys
+from dgae_jax.configs.config import Config, ConfigError
+from dgae_jax.configs.serial import MAY_CHANGE, differences
+from dgae_jax.learn.types import TrainState
+from dgae_jax.run import checkpoint, terminal
+from dgae_jax.run.checkpoint import CheckpointError, DamagedError
+from dgae_jax.run.evaluations import EvaluationsFile
+
+T = TypeVar("T")
+
+CHOICES = ("newest", "best")
+"""Which checkpoint: the newest whole one, or that of the best evaluation."""
+
+
+class Trained(NamedTuple):
+    """Policy and critic of every run in a checkpoint, with a leading axis of runs, and its file."""
+
+    policy: Fitted
+    critic: Fitted
+    path: Path
+
+
+def training_state(run_dir: Path, config: Config) -> tuple[TrainState, Path]:
+    """All of the newest checkpoint that is whole, and its file; warns of damaged ones.
+
+    Raises CheckpointError if there is none, or it is of another run than `config`.
+    """
+    return _newest(run_dir, partial(load_state, config=config))
+
+
+def trained(run_dir: Path, config: Config, which: str) -> Trained:
+    """The networks of the newest checkpoint or the best; nothing else in the file is looked at.
+
+    Raises ConfigError if the best is asked for and nothing was evaluated, CheckpointError as `training_state`.
+    """
+    if which not in CHOICES:
+        raise ConfigError(f"--checkpoint {which}: must be one of {', '.join(CHOICES)}")
+    if which == "newest":
+        return _newest(run_dir, partial(_load_networks, config=config))[0]
+    steps = EvaluationsFile(run_dir / "evaluations.jsonl").best
+    if steps is None:
+        raise ConfigError(f"--checkpoint {which}: must be newest: {run_dir} has no evaluations")
+    return _load_networks(run_dir / "checkpoints" / checkpoint.name_of(steps), config)
+
+
+def load_state(path: Path, config: Config) -> TrainState:
+    """The training state in one file; raises as `checkpoint.load`, and CheckpointError if the file is not of this run."""
+    _compare(path, config)
+    state = checkpoint.load(path, _blank(config))
+    for iteration in state.iteration:
+        if path.name != checkpoint.name_of(int(iteration) * config.samples_per_iteration):
+            raise CheckpointError(f"{path}: is renamed, it was saved after {iteration} iterations")
+    return state
+
+
+def _load_networks(path: Path, config: Config) -> Trained:
+    _compare(path, config)
+    blank: Any = _blank(config)
+    part = {
+        "policy": {"params": blank.policy.params},
+        "critic": {"params": blank.critic.params},
+        "observations": blank.observations,
+    }
+    got = checkpoint.load(path, part, part=True)
+    policy, critic = (Fitted(got[name]["params"], got["observations"]) for name in ("policy", "critic"))
+    return Trained(policy, critic, path)
+
+
+def _compare(path: Path, config: Config) -> None:
+    """Arrays of the same shapes may be of another run."""
+    for name, (ours, theirs) in differences(config, checkpoint.config_of(path)).items():
+        if name not in MAY_CHANGE:
+            raise CheckpointError(f"{path}: is of another run, its {name} is {theirs}, here {ours}")
+
+
+def _blank(config: Config) -> TrainState:
+    """Shapes and dtypes of a state."""
+    return jax.eval_shape(make_trainer(make_task(config), 1).init, config, seed_keys(config))
+
+
+def _newest(run_dir: Path, read: Callable[[Path], T]) -> tuple[T, Path]:
+    wrong = []
+    for path in reversed(checkpoint.found(run_dir / "checkpoints")):
+        try:
+            result = read(path)
+        except DamagedError as reason:
+            wrong.append(str(reason))
+            continue
+        for each in wrong:
+            terminal.warn(f"warning: {each}; falling back to {path.name}")
+        return result, path
+    raise CheckpointError("; ".join(wrong) or f"{run_dir}: must hold a checkpoint; checkpoints/ has none")

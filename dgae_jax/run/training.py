@@ -1,0 +1,160 @@
+"""One run, from its state to its evaluation: dispatch by dispatch until the budget is used or something ends it."""
+
+import contextlib
+import time
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+
+from dgae_jax.configs.build import Trainer, make_task, make_trainer, policies_of, seed_keys
+from dgae_jax.configs.config import Config
+from dgae_jax.learn.types import TrainState
+from dgae_jax.run import checkpoint, directory, files, manifest, terminal
+from dgae_jax.run.checkpoint import NotFiniteError
+from dgae_jax.run.compiling import compile_aside
+from dgae_jax.run.evaluation import engines_of, referee
+from dgae_jax.run.options import RunOptions
+from dgae_jax.run.progress import Reporter
+from dgae_jax.run.record import Record
+from dgae_jax.run.signals import Signals, Stopped
+
+CAPACITY = 64
+"""Most iterations in one dispatch."""
+DISPATCH_SECONDS = 2.0
+"""Aim for the time between looks at metrics, clock and signals."""
+
+
+class RunError(RuntimeError):
+    """A run that ended before its time; the message says why and how to go on."""
+
+    def __init__(self, exit_code: int, message: str):
+        super().__init__(message)
+        self.exit_code = exit_code
+        """1 broke down or could write no more; 130, 143, 129 stopped by SIGINT, SIGTERM, SIGHUP."""
+
+
+def run_to_end(config: Config, options: RunOptions, run_dir: Path, state: TrainState | None) -> dict[str, Any]:
+    """Train what is left, evaluate, and write `evaluation.json`, which is returned. Raises RunError."""
+    terminal.say(_budget(config))
+    done = 0 if state is None else int(state.iteration[0])
+    with Signals() as signals:
+        try:
+            with Record(run_dir, config, options, done) as record:
+                if options.resume:
+                    directory.write_config(run_dir, config)
+                    manifest.add(run_dir, options)
+                state = _iterate(config, options, record, signals, state)
+                if _broken(state, options):
+                    raise RunError(1, _broke_down(state, run_dir))
+                result = _evaluate(config, options, record, signals, state)
+            files.write_json(run_dir / "evaluation.json", result)
+        except Stopped:
+            raise RunError(signals.exit_code, f"stopped by {signals.name}; continue with --resume {run_dir}") from None
+        except NotFiniteError as reason:
+            raise RunError(1, f"stopped: {reason}, which is not saved; {_left(run_dir)}") from reason
+        except OSError as reason:
+            name = reason.filename or "output"
+            raise RunError(1, f"stopped: {name}: cannot be written ({reason.strerror}); {_left(run_dir)}") from reason
+        except (MemoryError, jax.errors.JaxRuntimeError) as reason:
+            if not _is_out_of_memory(reason):
+                raise
+            why = str(reason).partition("\n")[0][:200] or type(reason).__name__
+            raise RunError(1, f"stopped: out of memory ({why}); {_left(run_dir)}") from reason
+    return result
+
+
+def _iterate(config: Config, options: RunOptions, record: Record, signals: Signals, state: TrainState | None) -> TrainState:
+    """All iterations that are left, until the budget is used, a signal came, or it broke down."""
+    every = max(1, options.checkpoint_every // config.samples_per_iteration)
+    done, count, seconds = record.metrics.iteration, 1, 0.0
+    if state is not None and done == config.iterations:
+        return state
+    trainer = make_trainer(make_task(config), CAPACITY)
+    with Reporter(config.iterations * config.samples_per_iteration, config.num_seeds) as reporter:
+        resumed = state is not None
+        state = _compiled(config, trainer, state, signals, reporter)
+        if resumed and done % every == 0:
+            _look(record, state, signals, reporter)  # unless it was evaluated before it stopped
+        stopping = bool(signals.received)
+        while done < config.iterations and not stopping:
+            count = min(count, config.iterations - done, every - done % every)
+            since, warm = time.monotonic(), seconds > 0
+            state, measured = _dispatch(config, trainer, state, count, record)
+            mean_return = record.append(state, measured, count)
+            seconds, done = (time.monotonic() - since) / count, done + count
+            if warm:  # the first dispatch says nothing about speed
+                reporter.update(done * config.samples_per_iteration, config.samples_per_iteration / seconds, mean_return)
+            count = int(np.clip(DISPATCH_SECONDS / seconds, 1, CAPACITY)) if warm else 1
+            broken, due, stopping = _broken(state, options), done % every == 0, bool(signals.received)
+            if due or done == config.iterations or stopping or broken:
+                record.save(state)
+                record.draw()
+            if broken:
+                break
+            if due and done < config.iterations:
+                _look(record, state, signals, reporter)
+    return state
+
+
+def _compiled(config: Config, trainer: Trainer, state: TrainState | None, signals: Signals, reporter: Reporter) -> TrainState:
+    """The state to begin with, when the programs are compiled. Nothing is lost by ending meanwhile."""
+    reporter.announce("compiling")
+    with signals.may_stop():
+        if state is None:
+            compile_aside(trainer.init, config, seed_keys(config), watch=reporter.watch)
+            state = trainer.init(config, seed_keys(config))
+        compile_aside(trainer.dispatch, config, state, 1, watch=reporter.watch)
+    return state
+
+
+def _dispatch(config: Config, trainer: Trainer, state: TrainState, count: int, record: Record) -> tuple[TrainState, dict[str, Any]]:
+    """The next iterations; if there is no memory for them, the state before is saved, as far as it was not consumed."""
+    try:
+        return jax.block_until_ready(trainer.dispatch(config, state, count))
+    except (MemoryError, jax.errors.JaxRuntimeError) as reason:
+        if _is_out_of_memory(reason) and record.steps and not any(x.is_deleted() for x in jax.tree.leaves(state)):
+            record.save(state)
+        raise
+
+
+def _look(record: Record, state: TrainState, signals: Signals, reporter: Reporter) -> None:
+    """Evaluate on the way, unless a signal came: a run that goes on later makes up for it."""
+    if not record.evaluated:
+        with contextlib.suppress(Stopped), signals.may_stop():
+            record.evaluate(policies_of(state), reporter.watch)
+
+
+def _evaluate(config: Config, options: RunOptions, record: Record, signals: Signals, state: TrainState) -> dict[str, Any]:
+    """The evaluation at the end, which may take longer than a short training."""
+    with signals.may_stop(), Reporter() as reporter:
+        episodes = f"{options.episodes} episodes" + (f" of each of {config.num_seeds} seeds" if config.num_seeds > 1 else "")
+        reporter.announce(f"evaluating {episodes} in {referee(config)} ({engines_of(config)[0]})")
+        return record.evaluate(policies_of(state), reporter.watch)
+
+
+def _broken(state: TrainState, options: RunOptions) -> bool:
+    return int(state.failures.max()) >= options.max_nonfinite
+
+
+def _broke_down(state: TrainState, run_dir: Path) -> str:
+    reason = f"the last {int(state.failures.max())} updates were not finite and were left out"
+    return f"stopped: {reason}; the state before them is in {run_dir}"
+
+
+def _left(run_dir: Path) -> str:
+    """From what a run can go on."""
+    saved = checkpoint.found(run_dir / "checkpoints")
+    return f"continue from {saved[-1].name} with --resume {run_dir}" if saved else "there is no checkpoint"
+
+
+def _is_out_of_memory(reason: Exception) -> bool:
+    return isinstance(reason, MemoryError) or any(word in str(reason) for word in ("RESOURCE_EXHAUSTED", "MemoryError", "bad_alloc"))
+
+
+def _budget(config: Config) -> str:
+    runs, samples = f" × {config.num_seeds} seeds" if config.num_seeds > 1 else "", config.samples_per_iteration
+    task = config.env if config.env_version is None else f"{config.env}-{config.env_version}"
+    used = f"{config.iterations:,} iterations × {samples:,} samples = {config.iterations * samples:,}"
+    return f"{task} {config.algo} on {config.physics}: {used} of {config.total_steps:,} steps{runs}"
