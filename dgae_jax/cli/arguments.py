@@ -4,30 +4,35 @@ import argparse
 import contextlib
 import io
 import re
-import sys
 from collections.abc import Sequence
 from typing import Any, NoReturn, TypeVar
 
 import tyro
+
+from dgae_jax.configs.config import ConfigError, flag
+from dgae_jax.run import terminal
 
 T = TypeVar("T")
 
 _FRAME = re.compile(r"[╭╮╰╯├┤│─+|\- ]*")  # tyro draws it in ASCII where the terminal has no more
 
 
-def fail(message: str) -> NoReturn:
-    """One line on stderr, exit code 2."""
+def fail(mistake: Exception | str) -> NoReturn:
+    """One line on stderr, exit code 2; a setting of the library is written as its flag."""
+    message, setting = str(mistake), getattr(mistake, "setting", None)
+    if setting and message.startswith(setting):
+        message = flag(setting) + message[len(setting) :]
     shown = "".join(c if c.isprintable() else ascii(c)[1:-1] for c in message)  # one line, whatever was typed
-    print(f"error: {shown}", file=sys.stderr)
+    terminal.warn(f"error: {shown}")
     raise SystemExit(2)
 
 
-def peek(argv: Sequence[str] | None = None, **defaults: str) -> dict[str, str]:
-    """The values of some flags, looked at before the rest is parsed; underscores stand for dots."""
+def peek(argv: Sequence[str], *names: str) -> dict[str, str | None]:
+    """The values of some settings, looked at before the rest is parsed; None where there is none."""
     parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False, exit_on_error=False)
-    for name, default in defaults.items():
-        parser.add_argument("--" + name.replace("_", "."), dest=name, default=default, nargs="?")
-    return {name: defaults[name] if value is None else value for name, value in vars(parser.parse_known_args(argv)[0]).items()}
+    for name in names:
+        parser.add_argument(flag(name), flag(name).replace("-", "_").replace("__", "--", 1), dest=name, nargs="?")
+    return vars(parser.parse_known_args(argv)[0])
 
 
 def parse(cls: type[T], description: str, argv: Sequence[str] | None = None, default: T | None = None) -> T:
@@ -40,7 +45,7 @@ def parse(cls: type[T], description: str, argv: Sequence[str] | None = None, def
     except SystemExit as stop:
         if stop.code in (0, None):
             raise
-        fail(_one_line(screen.getvalue()))
+        fail(ConfigError(_one_line(screen.getvalue())))
 
 
 def _one_line(box: str) -> str:

@@ -1,4 +1,7 @@
-"""Train a policy: python experiments/train.py --env hopper --algo dppo --physics native"""
+"""Train a policy: dgae train --env hopper --algo dppo --physics native
+
+Flags are checked before the rest is imported: JAX, MuJoCo and Brax take seconds to load.
+"""
 
 import sys
 from dataclasses import dataclass, field
@@ -7,13 +10,13 @@ from typing import Annotated
 
 import tyro
 
-from dgae_jax import Config, ConfigError
 from dgae_jax.cli.arguments import fail, parse, peek
-from dgae_jax.configs import presets
+from dgae_jax.cli.spelling import understood
+from dgae_jax.configs.config import Config, ConfigError, invalid, resolve
+from dgae_jax.configs.presets import preset
+from dgae_jax.configs.validation import validate
 from dgae_jax.run import directory, manifest, terminal
-from dgae_jax.run.checkpoint import CheckpointError
-from dgae_jax.run.loop import resume, resume_or_start, train
-from dgae_jax.run.options import RunOptions
+from dgae_jax.run.options import RunOptions, validate_options
 
 
 @dataclass(frozen=True)
@@ -31,34 +34,47 @@ class Arguments:
 def main() -> int:
     """Train one run directory.
 
-    0 done; 1 broke down or could write no more; 2 bad input; 130 / 143 stopped by SIGINT / SIGTERM with a checkpoint saved.
+    0 done; 1 broke down or could write no more; 2 bad input; 129 / 130 / 143 stopped by SIGHUP / SIGINT / SIGTERM.
     """
     terminal.prepare()
     try:
-        first = peek(preset="", algo=Config.algo, env=Config.env, policy_update="default", config="", resume="")
-        config = _start(**first)
-        description = "Train a policy on a MuJoCo task with PPO, TRPO, A2C or their distributional variants."
-        run = manifest.options(Path(first["resume"])) if first["resume"] else RunOptions()
-        arguments = parse(Arguments, description, default=Arguments(settings=config, run=run))
-        work = resume_or_start if arguments.run.resume_or_start else resume if arguments.run.resume else train
-        return work(arguments.settings, arguments.run)
-    except (ConfigError, CheckpointError) as mistake:
-        fail(str(mistake))
+        config, options = parsed(sys.argv[1:])
+        from dgae_jax.run import loop
+
+        work = loop.resume_or_start if options.resume_or_start else loop.resume if options.resume else loop.train
+        return work(config, options)
+    except ConfigError as mistake:
+        fail(mistake)
     except KeyboardInterrupt:
-        print("stopped by SIGINT before training began", file=sys.stderr)
+        terminal.warn("stopped by SIGINT before training began")
         return 130
 
 
-def _start(preset: str, algo: str, env: str, policy_update: str, config: str, resume: str) -> Config:
+def parsed(argv: list[str]) -> tuple[Config, RunOptions]:
+    """The configuration in full and the options that a command line means; raises ConfigError for the first that is invalid."""
+    argv = understood(argv)
+    given = peek(argv, "preset", "config", "resume", "algo", "env", "policy.update", "critic.kind")
+    config = _start(given)
+    options = manifest.options(Path(given["resume"])) if given["resume"] else RunOptions()
+    description = "Train a policy on a MuJoCo task with PPO, TRPO, A2C or their distributional variants."
+    arguments = parse(Arguments, description, argv, default=Arguments(settings=config, run=options))
+    validate_options(arguments.run)
+    return validate(arguments.settings), arguments.run
+
+
+def _start(given: dict[str, str | None]) -> Config:
     """Where all settings start that no flag names: a run's own, a file's, or a preset's."""
-    for name, value, other in (("preset", preset, resume or config), ("config", config, resume)):
+    name, file, resume, algo = given["preset"], given["config"], given["resume"], given["algo"]
+    for setting, value, other in (("preset", name, resume or file), ("config", file, resume)):
         if value and other:
-            raise ConfigError(f"--{name} {value}: must be left out: all settings start from {other}")
-    if resume:
-        return directory.read_config(Path(resume))
-    if config:
-        return directory.read_config_file(Path(config))
-    return presets.preset(preset or "tuned", algo, env, policy_update)
+            raise invalid(setting, value, f"left out: all settings start from {other}")
+    if not (resume or file):
+        update, critic = given["policy.update"], given["critic.kind"]
+        return resolve(preset(name or "tuned", algo or "dppo", given["env"] or Config.env, update, critic))
+    config = directory.read_config(Path(resume)) if resume else directory.read_config_file(Path(str(file)))
+    if algo not in (None, config.algo):
+        raise invalid("algo", algo, f"{config.algo} as in {resume or file}, or left out")
+    return config
 
 
 if __name__ == "__main__":

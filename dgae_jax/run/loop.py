@@ -6,7 +6,9 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from dgae_jax.configs.build import make_task
 from dgae_jax.configs.config import Config, ConfigError, flag
+from dgae_jax.configs.memory import check_memory
 from dgae_jax.configs.serial import MAY_CHANGE, differences
 from dgae_jax.configs.validation import validate
 from dgae_jax.learn.types import TrainState
@@ -94,6 +96,7 @@ def _prepared(config: Config, options: RunOptions) -> Config:
     validate_options(options)
     machine.use_device(config)
     machine.use_cache(options.cache_dir)
+    check_memory(config, make_task(config), machine.memory())
     return config
 
 

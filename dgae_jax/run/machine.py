@@ -1,25 +1,30 @@
 """The machine a run is on."""
 
 import os
+import platform
 from pathlib import Path
+from typing import Any
 
 import jax
 
 from dgae_jax.configs.config import Config, ConfigError
 from dgae_jax.run import terminal
 
+_SETTINGS = ("jax_enable_x64", "jax_default_prng_impl", "jax_threefry_partitionable", "jax_default_matmul_precision")
+"""Of JAX, which the environment may change and on which the bits depend."""
+
 
 def use_device(config: Config) -> None:
     """Start JAX on its device; raises ConfigError if there is none of the kind asked for."""
     try:
-        platform = jax.devices()[0].platform
+        kind = jax.devices()[0].platform
     except Exception as reason:  # JAX raises many kinds, an AssertionError without a word for a missing plugin
         wanted, why = os.environ.get("JAX_PLATFORMS", ""), str(reason) or type(reason).__name__
         gpu = "" if wanted == "cpu" else 'an NVIDIA GPU needs pip install "dgae_jax[cuda13]"; '
         raise ConfigError(f"JAX_PLATFORMS={wanted}: must name a device that JAX finds here, cpu for one; {gpu}JAX says: {why}") from reason
-    if config.physics == "native" and platform != "cpu":
+    if config.physics == "native" and kind != "cpu":
         terminal.warn(
-            f"warning: --physics native simulates on the CPU and everything else runs on the {platform}, so that each step crosses"
+            f"warning: --physics native simulates on the CPU and everything else runs on the {kind}, so that each step crosses"
             f" between them; --physics jax or JAX_PLATFORMS=cpu keeps all in one place"
         )
 
@@ -35,3 +40,43 @@ def use_cache(cache_dir: str) -> None:
     except (OSError, RuntimeError) as reason:
         raise ConfigError(f"--cache-dir {cache_dir}: must be a directory that can be written, or none ({reason})") from reason
     jax.config.update("jax_compilation_cache_dir", str(path))
+
+
+def facts() -> dict[str, Any]:
+    """What of the machine decides how numbers are rounded."""
+    return {
+        "device": f"{jax.default_backend()}: {_model()}",
+        "devices": jax.device_count(),
+        "cores": _cores(),
+        "settings": {name: getattr(jax.config, name, None) for name in _SETTINGS} | {"XLA_FLAGS": os.environ.get("XLA_FLAGS")},
+    }
+
+
+def _model() -> str:
+    """Of the device; JAX calls every CPU the same, but compiles for the one it finds."""
+    if jax.default_backend() != "cpu":
+        return jax.devices()[0].device_kind
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+        return next(line.partition(":")[2].strip() for line in lines if line.startswith("model name"))
+    except (OSError, StopIteration):
+        return platform.processor() or platform.machine()
+
+
+def _cores() -> int | None:
+    """Cores this process may use: on a CPU their number decides how sums are split, and so their rounding."""
+    if jax.default_backend() != "cpu":
+        return None
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+
+
+def memory() -> int:
+    """Bytes that a run may take: of the device, or of this machine or the control group that this process is in."""
+    limit = (jax.devices()[0].memory_stats() or {}).get("bytes_limit") if jax.default_backend() != "cpu" else None
+    if limit:
+        return int(limit)
+    total = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    try:
+        return min(total, int(Path("/sys/fs/cgroup/memory.max").read_text()))
+    except (OSError, ValueError):  # no control groups, or no limit
+        return total

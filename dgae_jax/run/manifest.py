@@ -2,7 +2,6 @@
 
 import importlib.metadata
 import json
-import os
 import platform
 import subprocess
 import sys
@@ -11,15 +10,10 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-import jax
-
 from dgae_jax.run import files
 from dgae_jax.run.options import RunOptions, from_dict, to_dict
 
 _VERSIONS_OF = ("dgae_jax", "jax", "jaxlib", "flax", "optax", "brax", "mujoco", "mujoco-mjx", "gymnasium", "numpy")
-
-_SETTINGS = ("jax_enable_x64", "jax_default_prng_impl", "jax_threefry_partitionable", "jax_default_matmul_precision")
-"""Of JAX, which the environment may change and on which the bits depend."""
 
 
 def write(run_dir: Path, options: RunOptions) -> None:
@@ -73,36 +67,17 @@ def _resumed(manifest: dict[str, Any]) -> list[Any]:
 
 
 def _now() -> dict[str, Any]:
+    from dgae_jax.run import machine  # JAX is loaded when a run begins, not to read an old manifest
+
     return {
         "started": time.strftime("%Y-%m-%dT%H:%M:%S%z"),
         "command": sys.argv,
         "git_revision": _git_revision(),
         "python": platform.python_version(),
         "platform": platform.platform(),
-        "device": f"{jax.default_backend()}: {_model()}",
-        "devices": jax.device_count(),
-        "cores": _cores(),
-        "settings": {name: getattr(jax.config, name, None) for name in _SETTINGS} | {"XLA_FLAGS": os.environ.get("XLA_FLAGS")},
+        **machine.facts(),
         "versions": {name: _version(name) for name in _VERSIONS_OF},
     }
-
-
-def _model() -> str:
-    """Of the device; JAX calls every CPU the same, but compiles for the one it finds."""
-    if jax.default_backend() != "cpu":
-        return jax.devices()[0].device_kind
-    try:
-        lines = Path("/proc/cpuinfo").read_text().splitlines()
-        return next(line.partition(":")[2].strip() for line in lines if line.startswith("model name"))
-    except (OSError, StopIteration):
-        return platform.processor() or platform.machine()
-
-
-def _cores() -> int | None:
-    """Cores this process may use: on a CPU their number decides how sums are split, and so their rounding."""
-    if jax.default_backend() != "cpu":
-        return None
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
 
 
 @cache

@@ -1,0 +1,32 @@
+"""The console command: `dgae COMMAND …` is `python experiments/COMMAND.py …`."""
+
+import sys
+from importlib import import_module
+
+from dgae_jax.run import terminal
+
+COMMANDS = {
+    "train": "train a policy and write a run directory",
+    "evaluate": "evaluate the policy of a run directory",
+}
+"""Each is a module of this room with a `main`."""
+
+
+def main() -> int:
+    """Run one command; 2 for a name that is none."""
+    terminal.prepare()
+    if len(sys.argv) < 2 or sys.argv[1] in ("-h", "--help"):
+        terminal.say("usage: dgae COMMAND [flags]; dgae COMMAND --help lists the flags\n")
+        for name, purpose in COMMANDS.items():
+            terminal.say(f"  {name:10s} {purpose}")
+        return 0
+    name = sys.argv[1]
+    if name not in COMMANDS:
+        terminal.warn(f"error: {ascii(name)[1:-1]}: must be one of {', '.join(COMMANDS)}")
+        return 2
+    sys.argv = [f"dgae {name}", *sys.argv[2:]]
+    return import_module(f"dgae_jax.cli.{name}").main()
+
+
+if __name__ == "__main__":
+    sys.exit(main())
