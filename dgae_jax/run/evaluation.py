@@ -11,10 +11,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from dgae_jax.configs.build import Fitted, Trainer, make_greedy, make_task, make_trainer
+from dgae_jax.configs.build import Fitted, make_greedy, make_task, make_trainer
 from dgae_jax.configs.config import Config, ConfigError
 from dgae_jax.envs.registry import BRAX, PHYSICS, TASKS
 from dgae_jax.learn import play
+from dgae_jax.learn.parallel import Trainer
 from dgae_jax.run import restore
 from dgae_jax.run.compiling import Watch, compile_aside, unwatched
 from dgae_jax.run.summary import over_seeds, summary

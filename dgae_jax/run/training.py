@@ -8,8 +8,9 @@ from typing import Any
 import jax
 import numpy as np
 
-from dgae_jax.configs.build import Trainer, make_task, make_trainer, policies_of, seed_keys
+from dgae_jax.configs.build import make_task, make_trainer, policies_of, seed_keys
 from dgae_jax.configs.config import Config
+from dgae_jax.learn.parallel import Trainer
 from dgae_jax.learn.types import TrainState
 from dgae_jax.run import checkpoint, directory, files, manifest, terminal
 from dgae_jax.run.checkpoint import NotFiniteError
