@@ -12,7 +12,7 @@ from brax.envs.base import Env
 from dgae_jax.configs.algorithms import TABLE
 from dgae_jax.configs.config import Config, CriticConfig, PolicyConfig, resolve
 from dgae_jax.envs.noise import Noisy
-from dgae_jax.envs.registry import make_env
+from dgae_jax.envs.registry import make_env, spec_of
 from dgae_jax.learn import diagnostics, iteration
 from dgae_jax.learn.critics import CRITICS, RESIDUALS
 from dgae_jax.learn.networks import gaussian_policy
@@ -24,7 +24,9 @@ from dgae_jax.maths.risk import weights_of
 
 def make_task(config: Config) -> Env:
     """The environment a configuration names."""
-    env, noise = make_env(config.env, physics=config.physics, version=config.env_version), dataclasses.asdict(config.noise)
+    spec, noise = spec_of(config.env), dataclasses.asdict(config.noise)
+    chosen = {"physics": config.physics, "version": config.env_version} if spec.versions else {}
+    env = make_env(config.env, **chosen)
     return Noisy(env, **noise) if any(noise.values()) else env
 
 

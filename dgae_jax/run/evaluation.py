@@ -13,7 +13,7 @@ import numpy as np
 
 from dgae_jax.configs.build import make_greedy, make_task
 from dgae_jax.configs.config import Config, ConfigError
-from dgae_jax.envs.registry import BRAX, TASKS
+from dgae_jax.envs.registry import BRAX, spec_of
 from dgae_jax.learn.rollout import evaluate
 from dgae_jax.learn.types import TrainState
 from dgae_jax.run import checkpoint, files
@@ -98,9 +98,7 @@ def _is_evaluation(row: dict[str, Any]) -> bool:
 
 def referee(config: Config) -> str:
     """Gymnasium's name of the task, or Brax's."""
-    if config.env.startswith(BRAX):
-        return config.env
-    return f"{TASKS[config.env].NAME}-{config.env_version}"
+    return spec_of(config.env).referee(config.env_version) or config.env
 
 
 def _summary(returns: np.ndarray) -> dict[str, Any]:
