@@ -11,6 +11,7 @@ from dgae_jax.configs.config import Config, ConfigError, invalid, lookup, resolv
 from dgae_jax.configs.parts import COVARIANCES, CRITICS, OPTIMIZERS, RESIDUALS, TARGETS, UPDATES
 from dgae_jax.configs.serial import check_types
 from dgae_jax.maths.risk import check_metric
+from dgae_jax.physics.registry import require
 
 LARGEST = 2**31 - 1
 """What an int32, the largest index and counter of a device, can hold."""
@@ -81,6 +82,10 @@ def _get(config: Config, path: str) -> Any:
 def _check_task(config: Config) -> None:
     spec = task_spec(config)
     lookup("physics", config.physics, dict.fromkeys(spec.engines))
+    try:
+        require(str(config.physics))
+    except ValueError as reason:
+        raise ConfigError(str(reason), "physics") from None
     if spec.versions:
         lookup("env_version", config.env_version, dict.fromkeys(spec.versions))
     else:

@@ -1,4 +1,8 @@
-"""Ant, Hopper, Swimmer and Walker2d, v4 (the same as Gym's v3) and v5: constants and semantics are Gymnasium's own."""
+"""Ant, Hopper, Swimmer and Walker2d, v4 and v5: constants and semantics are Gymnasium's own.
+
+Gymnasium made v4 as Gym's v3 on the `mujoco` bindings. Hopper, Swimmer and Walker2d are the same in both; Ant's v3 also observes
+84 contact forces and pays for them, which v4 does only with `use_contact_forces=True`.
+"""
 
 from math import inf
 
@@ -7,7 +11,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from dgae_jax.envs.task import HealthyTask, Task
-from dgae_jax.physics.engine import Physics, PhysicsState
+from dgae_jax.physics.engine import Physics, PhysicsState, Reads
 
 Range = tuple[float, float]
 
@@ -20,7 +24,7 @@ class Walker2d(HealthyTask):
     """Walk forward on two legs. Observation [17]: eight positions (m, rad), nine velocities clipped to ±10."""
 
     NAME, FILE = "Walker2d", {"v4": "walker2d.xml", "v5": "walker2d_v5.xml"}
-    CONTACTS, AXES, VELOCITY_LIMIT = 10, 1, 10.0
+    AXES, VELOCITY_LIMIT = 1, 10.0
 
     def __init__(
         self,
@@ -45,7 +49,6 @@ class Hopper(Walker2d):
     """Hop forward on one leg. Observation [11]: five positions (m, rad), six velocities clipped to ±10."""
 
     NAME, FILE = "Hopper", {"v4": "hopper.xml", "v5": "hopper.xml"}
-    CONTACTS = 8
 
     def __init__(
         self,
@@ -69,7 +72,7 @@ class Swimmer(Task):
     """Swim forward in a plane. Observation [8]: three angles (rad), five velocities. It never terminates."""
 
     NAME, FILE = "Swimmer", {"v4": "swimmer.xml", "v5": "swimmer.xml"}
-    CONTACTS, AXES = None, 2
+    AXES = 2
     TERMS = ("reward_forward", "reward_ctrl")
 
     def __init__(self, physics: Physics, version: str, *, ctrl_cost_weight: float = 1e-4, reset_noise_scale: float = 0.1, **parameters):
@@ -83,7 +86,7 @@ class Ant(HealthyTask):
     """
 
     NAME, FILE, FRAME_SKIP = "Ant", dict.fromkeys(("v4", "v5"), "ant.xml"), 5
-    CONTACTS, AXES = 8, 2
+    AXES = 2
     TERMS = (*HealthyTask.TERMS, "reward_contact")
 
     def __init__(
@@ -109,12 +112,12 @@ class Ant(HealthyTask):
         self._observed_bodies = slice(0 if version == "v4" else 1, None if observed else 0)
 
     @staticmethod
-    def needs_contact_forces(version: str, use_contact_forces: bool = False, **parameters) -> bool:
-        """Whether reward or observation use them: always in v5, where asked for in v4."""
-        return version == "v5" or use_contact_forces
+    def reads(version: str, use_contact_forces: bool = False, **parameters) -> Reads:
+        """The torso's position; contact forces always in v5, where asked for in v4."""
+        return Reads(bodies=("torso",), forces=version == "v5" or use_contact_forces)
 
     def _position(self, physics: PhysicsState) -> Float[Array, "2"]:
-        return physics.torso[:2]
+        return physics.xpos[0, :2]
 
     def _is_healthy(self, physics: PhysicsState) -> Bool[Array, ""]:
         low, high = self._healthy_z_range
@@ -125,7 +128,7 @@ class Ant(HealthyTask):
         return self._reset_noise_scale * jax.random.normal(key, (self._physics.model.nv,))
 
     def _forces(self, physics: PhysicsState) -> Float[Array, "E 6"]:
-        return jnp.clip(physics.contact, *self._contact_force_range)
+        return jnp.clip(physics.cfrc_ext, *self._contact_force_range)
 
     def _terms(self, before, after, action, velocity):
         cost = self._contact_cost_weight * jnp.square(self._forces(after)).sum()

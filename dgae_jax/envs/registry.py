@@ -1,83 +1,102 @@
-"""Tasks and physics by name."""
+"""The tasks by name: where each is built, what it runs on, who evaluates it.
 
-import warnings
-from functools import partial
-from typing import NamedTuple
+Importing this loads no task, so that names can be checked before JAX, MuJoCo and Brax are imported.
+"""
 
-import brax.envs
-import jax.numpy as jnp
-from brax.envs.base import Env, Wrapper
-from jaxtyping import Array, Float
+import sys
+from collections.abc import Mapping
+from pkgutil import resolve_name
+from typing import TYPE_CHECKING, Any, NamedTuple
 
-from dgae_jax.envs.gym_tasks import Ant, Hopper, Swimmer, Walker2d
-from dgae_jax.envs.task import Task, load_spec
-from dgae_jax.physics.jax.engine import jax_engine
-from dgae_jax.physics.native import native
+from dgae_jax.physics.registry import ENGINES
 
-TASKS: dict[str, type[Task]] = {"ant": Ant, "hopper": Hopper, "swimmer": Swimmer, "walker2d": Walker2d}
-PHYSICS = {"jax": jax_engine, "native": native}
-VERSIONS = ("v4", "v5")
+if TYPE_CHECKING:
+    from brax.envs.base import Env
 
 BRAX = "brax:"
 """Before the name of an environment of Brax's own."""
+
+BRAX_NAMES = (
+    "ant", "fast", "halfcheetah", "hopper", "humanoid", "humanoidstandup", "inverted_pendulum", "inverted_double_pendulum",
+    "pusher", "reacher", "walker2d",
+)  # fmt: skip
+"""Environments of Brax's own that it builds on its MJX backend; its swimmer is not one of them."""
 
 
 class EnvSpec(NamedTuple):
     """What exists of a task."""
 
+    builder: str
+    """`module:function` of (*arguments, physics, version, **task_parameters), which returns the environment."""
+    arguments: tuple[str, ...]
     engines: tuple[str, ...]
-    versions: tuple[str, ...]
+    """Names of the engines it runs on; the first is the default."""
+    referees: Mapping[str, str]
+    """Gymnasium's id for each version, the first of them the default. Empty for a task without versions, which is evaluated in
+    its own engine."""
+
+    @property
+    def default_engine(self) -> str:
+        """The engine where none is named."""
+        return self.engines[0]
+
+    @property
+    def versions(self) -> tuple[str, ...]:
+        """Gymnasium's versions whose semantics the task has; empty where it has none."""
+        return tuple(self.referees)
+
+    @property
+    def default_version(self) -> str | None:
+        """The version where none is named; None for a task without versions."""
+        return next(iter(self.referees), None)
+
+    def referee(self, version: str | None = None) -> str | None:
+        """Gymnasium's id of the task that evaluates policies; None: the task itself, in its own engine."""
+        return self.referees[version or self.versions[0]] if self.referees else None
+
+    def choose(self, physics: str | None = None, version: str | None = None) -> tuple[str, str | None]:
+        """Engine and version, with the defaults filled in; raises ValueError, naming what is allowed."""
+        physics = self.default_engine if physics is None else physics
+        version = self.default_version if version is None else version
+        if physics not in self.engines:
+            raise ValueError(f"physics {physics}: must be one of {', '.join(self.engines)}")
+        if version is not None and version not in self.versions:
+            raise ValueError(f"version {version}: must be {'one of ' + ', '.join(self.versions) if self.versions else 'left out'}")
+        return physics, version
+
+
+def _ours(name: str) -> EnvSpec:
+    return EnvSpec(f"dgae_jax.envs.gym_tasks:{name}.make", (), tuple(ENGINES), {v: f"{name}-{v}" for v in ("v4", "v5")})
+
+
+TASKS = {name.lower(): _ours(name) for name in ("Ant", "Hopper", "Swimmer", "Walker2d")}
 
 
 def spec_of(name: str) -> EnvSpec:
-    """What exists of the task `name`; raises ValueError, saying what is allowed, for an unknown one."""
-    if name.startswith(BRAX) and name.removeprefix(BRAX) in brax.envs._envs and not name.startswith(BRAX + "dgae_"):
-        return EnvSpec(("mjx",), ())
-    if name not in TASKS:
-        raise ValueError(f"one of {', '.join(TASKS)}, or {BRAX}NAME with a name that brax.envs knows")
-    return EnvSpec(("jax", "native"), VERSIONS)
+    """What exists of the task `name`; raises ValueError with "one of …" for an unknown one."""
+    if name in TASKS:
+        return TASKS[name]
+    if name.startswith(BRAX) and name.removeprefix(BRAX) in _brax_names():
+        return EnvSpec("dgae_jax.envs.brax:make", (name.removeprefix(BRAX),), ("mjx",), {})
+    raise ValueError(f"one of {', '.join(TASKS)}, or {BRAX}NAME with NAME one of {', '.join(_brax_names())}")
 
 
-class BraxTask(Wrapper):
-    """An environment of Brax's own, whose actions lie in [−1, 1]."""
-
-    @property
-    def action_range(self) -> tuple[Float[Array, " A"], Float[Array, " A"]]:
-        """The lowest and highest action."""
-        return -jnp.ones(self.action_size), jnp.ones(self.action_size)
+def _brax_names() -> list[str]:
+    """Brax's own names and those that somebody registered with it."""
+    brax: Any = sys.modules.get("brax.envs")
+    registered = () if brax is None else (n for n in brax._envs if not n.startswith("dgae_") and n != "swimmer")
+    return sorted({*BRAX_NAMES, *registered})
 
 
-def make_env(name: str, *, physics: str | None = "jax", version: str | None = "v4", **task_parameters) -> Env:
-    """The task `name` over the physics `physics`, with Gymnasium's semantics of `version` (v4 is Gym's v3).
+def make_env(name: str, *, physics: str | None = None, version: str | None = None, **task_parameters) -> "Env":
+    """The task `name` over the engine `physics`, with Gymnasium's semantics of `version`: by default `jax` and `v4`.
 
     `task_parameters` are those of Gymnasium's constructor. `brax:NAME` is an environment of Brax's own, on `mjx`; its
-    parameters are those of Brax's constructor. Raises ValueError, naming what exists, for an unknown name.
+    parameters are those of Brax's constructor. Raises ValueError, naming what is allowed, for an unknown name, an engine
+    that the task does not run on or that is not installed, and a version that it does not have.
     """
-    if name.startswith(BRAX):
-        return _make_brax(name.removeprefix(BRAX), physics, **task_parameters)
-    for what, value, table in (("environment", name, TASKS), ("physics", physics, PHYSICS), ("version", version, VERSIONS)):
-        if value not in table:
-            raise ValueError(f"unknown {what} {value!r}; choose from {', '.join(table)}")
-    task = TASKS[name]
-    engine = PHYSICS[physics](
-        load_spec(task.FILE[version]),
-        task.FRAME_SKIP,
-        max_contacts=task.CONTACTS,
-        contact_forces=task.needs_contact_forces(version, **task_parameters),
-    )
-    return task(engine, version, **task_parameters)
-
-
-def _make_brax(name: str, physics: str, **parameters) -> Env:
-    if physics != "mjx":
-        raise ValueError(f"environments of Brax's own run on mjx, not on {physics}")
     try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # Brax speaks of features of its model files that it leaves out
-            return BraxTask(brax.envs.get_environment(name, backend="mjx", **parameters))
-    except KeyError:
-        raise ValueError(f"unknown environment {BRAX}{name}; brax.envs knows no {name!r}") from None
-
-
-for _name in TASKS:  # for Brax's own trainers: brax.envs.get_environment("dgae_hopper", physics="jax")
-    brax.envs.register_environment(f"dgae_{_name}", partial(make_env, _name))  # pyright: ignore[reportArgumentType]
+        spec = spec_of(name)
+    except ValueError as allowed:
+        raise ValueError(f"environment {name}: must be {allowed}") from None
+    return resolve_name(spec.builder)(*spec.arguments, *spec.choose(physics, version), **task_parameters)

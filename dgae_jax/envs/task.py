@@ -1,4 +1,4 @@
-"""What Gymnasium's MuJoCo tasks share, as a `brax.envs.base.Env` over any physics.
+"""What Gymnasium's MuJoCo tasks share, as a `brax.envs.base.Env` over any physics engine.
 
 What differs between tasks is a method, what differs between versions a line that names the version. The time limit
 belongs to the rollout, not to the task.
@@ -15,7 +15,8 @@ import mujoco
 from brax.envs.base import Env, State
 from jaxtyping import Array, ArrayLike, Bool, Float
 
-from dgae_jax.physics.engine import Physics, PhysicsState
+from dgae_jax.physics.engine import Physics, PhysicsState, Reads
+from dgae_jax.physics.registry import make_physics
 
 
 def load_spec(filename: str) -> mujoco.MjSpec:
@@ -39,8 +40,6 @@ class Task(Env):
     FRAME_SKIP: ClassVar[int] = 4
     NAME: ClassVar[str]
     """Gymnasium's name, without the version."""
-    CONTACTS: ClassVar[int | None]
-    """More contacts than the model was ever seen to have, which bounds MJX's constraint rows; None without contacts."""
     AXES: ClassVar[int]
     """Leading positions that the observation leaves out: one for x, two for x and y."""
     VELOCITY_LIMIT: ClassVar[float] = inf
@@ -65,12 +64,18 @@ class Task(Env):
         self._first_position = self.AXES * exclude_current_positions_from_observation
         self._init_qpos = jnp.asarray(physics.model.qpos0)
 
+    @classmethod
+    def make(cls, physics: str, version: str, **parameters) -> "Task":
+        """The task over the engine named `physics`."""
+        spec, reads = load_spec(cls.FILE[version]), cls.reads(version, **parameters)
+        return cls(make_physics(physics, spec, cls.FRAME_SKIP, reads), version, **parameters)
+
     # ---- what a task may say differently ----
 
     @staticmethod
-    def needs_contact_forces(version: str, **parameters) -> bool:
-        """Whether reward or observation use the external forces on the bodies."""
-        return False
+    def reads(version: str, **parameters) -> Reads:
+        """What reward and observation use besides positions and velocities."""
+        return Reads()
 
     def _terms(self, before: PhysicsState, after: PhysicsState, action: Array, velocity: Array) -> dict[str, Array]:
         """The reward's terms, in the order of `TERMS`; their sum is the reward."""

@@ -13,7 +13,7 @@ import numpy as np
 
 from dgae_jax.configs.build import Fitted, make_greedy, make_task, make_trainer
 from dgae_jax.configs.config import Config, ConfigError
-from dgae_jax.envs.registry import BRAX, PHYSICS, TASKS
+from dgae_jax.envs.registry import spec_of
 from dgae_jax.learn import play
 from dgae_jax.learn.parallel import Trainer
 from dgae_jax.run import restore
@@ -26,12 +26,13 @@ CHUNK = 50
 
 def engines_of(config: Config) -> tuple[str, ...]:
     """Where a run can be evaluated, the referee first: Gymnasium for our tasks, the run's own physics for any other."""
-    return (config.physics,) if config.env.startswith(BRAX) else ("gymnasium", *PHYSICS)
+    spec = spec_of(config.env)
+    return ("gymnasium", *spec.engines) if spec.referees else spec.engines
 
 
 def referee(config: Config) -> str:
     """Gymnasium's name of the task, or Brax's."""
-    return config.env if config.env.startswith(BRAX) else f"{TASKS[config.env].NAME}-{config.env_version}"
+    return spec_of(config.env).referee(config.env_version) or config.env
 
 
 def default_path(run_dir: Path, engine: str, which: str) -> Path:

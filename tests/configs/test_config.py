@@ -28,7 +28,7 @@ def test_the_default_configuration_is_valid():
         ("env", "hoper", "one of ant, hopper, swimmer, walker2d"),
         ("env_version", "v9", "one of v4, v5"),
         ("algo", "sac", "one of ppo, dppo"),
-        ("physics", "bullet", "one of jax, native"),
+        ("physics", "bullet", "one of jax, mjx, mjx-warp, native"),
         ("seed", -1, "from 0 to"),
         ("num_seeds", 0, "from 1 to 4,096"),
         ("total_steps", 2047, "at least one iteration of num_envs \\* horizon = 2,048"),

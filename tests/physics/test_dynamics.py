@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from dgae_jax.envs.registry import TASKS
 from dgae_jax.envs.task import load_spec
 from dgae_jax.physics.jax import contacts, dynamics, spatial
 from dgae_jax.physics.jax.scene import scene_of
+from tests.helpers import GYM_TASKS
 
 # a floating tree that uses what the four tasks do not: anchors off the origin, springs, a body without joints, any orientation
 SPRINGY = """
@@ -23,7 +23,7 @@ SPRINGY = """
 
 
 def model_of(name):
-    return mujoco.MjModel.from_xml_string(SPRINGY) if name == "springy" else load_spec(TASKS[name].FILE["v4"]).compile()
+    return mujoco.MjModel.from_xml_string(SPRINGY) if name == "springy" else load_spec(GYM_TASKS[name].FILE["v4"]).compile()
 
 
 @functools.cache
@@ -45,7 +45,7 @@ def forwards(name):
         yield i, data
 
 
-@pytest.mark.parametrize("name", [*sorted(TASKS), "springy"])
+@pytest.mark.parametrize("name", [*sorted(GYM_TASKS), "springy"])
 def test_every_quantity_of_the_tree_is_mujocos(name):
     model = model_of(name)
     with jax.enable_x64(True):
@@ -62,7 +62,7 @@ def test_every_quantity_of_the_tree_is_mujocos(name):
         assert_allclose(acceleration[..., i], data.qacc_smooth, rtol=1e-9, atol=1e-9)
 
 
-@pytest.mark.parametrize("name", sorted(TASKS))
+@pytest.mark.parametrize("name", sorted(GYM_TASKS))
 def test_constraint_rows_are_mujocos(name):
     model = model_of(name)
     with jax.enable_x64(True):

@@ -1,7 +1,7 @@
 """Where the limits and contacts of a scene are, and their constraint rows.
 
-Distances, frames and rows are MuJoCo's: soft constraints, with pyramids for friction cones. A row asks for
-J a ≥ reference, up to its regularisation 1/D; D is zero where nothing is touched.
+Distances, frames and rows are MuJoCo's: soft constraints, with pyramidal friction cones. A row asks for
+J a ≥ a_ref, up to its regularisation R = 1/D; D is zero for a row that is not active (distance ≥ margin).
 """
 
 from typing import NamedTuple
@@ -18,23 +18,29 @@ from dgae_jax.physics.jax.spatial import apply, combine, constant, cross, dot, u
 
 
 class Met(NamedTuple):
-    """Where K contacts are, with their constants as arrays."""
+    """K contacts of W worlds: MuJoCo's `mjContact`."""
 
     touching: Touching
+    """Their constants, as arrays."""
     distance: Float[Array, "K W"]
+    """`contact.dist` [m]; negative: penetration."""
     position: Float[Array, "K 3 W"]
+    """`contact.pos`, midway between the surfaces [m]."""
     normal: Float[Array, "K 3 W"]
-    """From the first body to the second."""
+    """The first axis of `contact.frame`, from the first body to the second."""
     tangent: Float[Array, "K 3 W"]
+    """The second axis of `contact.frame`; the third is their cross product."""
 
 
 class Rows(NamedTuple):
-    """C constraint rows."""
+    """C constraint rows of W worlds."""
 
     jacobian: Float[Array, "V C W"]
+    """`efc_J`, transposed."""
     stiffness: Float[Array, "C W"]
-    """D."""
+    """`efc_D`, the inverse of the regularisation `efc_R`; zero for a row that is not active."""
     reference: Float[Array, "C W"]
+    """`efc_aref`, the reference acceleration."""
 
 
 def constrain(scene: Scene, tree: Tree, smooth: Smooth, qpos: Array, qvel: Array) -> tuple[Rows, list[Met]]:
@@ -67,7 +73,7 @@ def _contact_rows(frictionless: bool, met: Met, smooth: Smooth, qvel: Array) -> 
 
 
 def _rows(softness: Softness, jacobian: Array, distance: Array, qvel: Array) -> Rows:
-    """MuJoCo's impedance, regularisation and reference acceleration."""
+    """MuJoCo's impedance d(r), regularisation `efc_R` = `efc_diagApprox` (1 − d)/d and `efc_aref` = −b (J v) − k d r."""
     gap = distance - softness.margin
     low, high, width, middle, power = (softness.impedance[:, i] for i in range(5))
     x = jnp.minimum(jnp.abs(gap) / width, 1)
@@ -140,7 +146,7 @@ def _nearest(group: Group, distance: Array, *where: Array) -> Met:
 
 
 def contact_forces(scene: Scene, model: mujoco.MjModel, met: list[Met], centre: Array, pushes: Array) -> Float[Array, "B 6 W"]:
-    """Torque about the tree's centre of mass and force on each body, MuJoCo's `cfrc_ext`, from the forces along the rows."""
+    """`cfrc_ext`: torque about the tree's centre of mass and force on each body, from the `efc_force` of the rows."""
     out, at = jnp.zeros((model.nbody, 6, centre.shape[-1]), centre.dtype), len(scene.limited)
     for group, m in zip(scene.groups, met, strict=True):
         edges, count = 1 if group.frictionless else 4, len(m.distance)

@@ -53,14 +53,15 @@ class Smooth(NamedTuple):
     """The dynamics before constraints."""
 
     frames: Float[Array, "F 3 4 W"]
-    """Rotation and position of each joint's frame."""
+    """Rotation and position of each joint's frame, `xmat` and `xpos` of the body behind the joint."""
     centre: Float[Array, "3 W"]
-    """Centre of mass."""
+    """Centre of mass, `subtree_com` of the root [m]."""
     axes: Float[Array, "V 6 W"]
-    """How a unit of each velocity moves: MuJoCo's `cdof`."""
+    """How a unit of each velocity moves the tree, `cdof`."""
     mass: Float[Array, "V V W"]
+    """`qM` in full."""
     force: Float[Array, "V W"]
-    """Of motors, springs, dampers, gravity, fluid and motion."""
+    """`qfrc_smooth`: motors, springs, dampers, gravity, fluid and bias [N, N m]."""
 
 
 def quat_matrix(quat: np.ndarray) -> np.ndarray:

@@ -11,10 +11,11 @@ import jax.numpy as jnp
 import mujoco
 from jaxtyping import Array
 
-from dgae_jax.physics.engine import Physics, PhysicsState
+from dgae_jax.physics.engine import Physics, PhysicsState, Reads, body_ids
 from dgae_jax.physics.jax import contacts, dynamics, newton, spatial
 from dgae_jax.physics.jax.coverage import refuse_uncovered
-from dgae_jax.physics.jax.scene import scene_of
+from dgae_jax.physics.jax.scene import known_bound, scene_of
+from dgae_jax.physics.worlds import of_one_world
 
 _STAGE = (0.0, 0.5, 0.5, 1.0)
 _WEIGHT = (1 / 6, 1 / 3, 1 / 3, 1 / 6)
@@ -23,28 +24,30 @@ _BLOCK = 128
 _CORRECTS_ROTATION = int(mujoco.__version__.split(".")[0]) >= 4
 
 
-def jax_engine(spec: mujoco.MjSpec, frame_skip: int, *, contact_forces: bool = False, max_contacts: int | None = None) -> Physics:
+def jax_engine(spec: mujoco.MjSpec, frame_skip: int, reads: Reads, *, max_contacts: int | None = None) -> Physics:
     """MuJoCo in JAX, advancing one world; vmap it. Raises ValueError, naming the reason, for a model it does not cover.
 
-    `max_contacts` bounds the contacts with the ground; the nearest are kept.
+    `max_contacts` bounds the contacts with the ground, of which the nearest are kept; by default it is the bound that is
+    known for the model (`scene.known_bound`), or all that are possible.
     """
     model = spec.compile()
     refuse_uncovered(model)
     tree = dynamics.tree_of(model)
-    scene = scene_of(tree, max_contacts)
-    h, free = model.opt.timestep, tree.floating
+    scene = scene_of(tree, known_bound(spec.modelname, model) if max_contacts is None else max_contacts)
+    h, free, torsos = model.opt.timestep, tree.floating, len(body_ids(model, reads))  # of one tree only the root can float
 
     def forward(guess, qpos, qvel, ctrl):
-        """Acceleration, torso position and contact forces."""
+        """`qacc`, and `xpos` and `cfrc_ext` as far as they are read."""
         s = dynamics.smooth(tree, qpos, qvel, ctrl)
-        torso, contact = s.frames[0, :, 3] if free else qpos[:0], jnp.zeros((0, 6, qpos.shape[-1]), qpos.dtype)
+        xpos = jnp.repeat(s.frames[:1, :, 3], torsos, 0)
+        cfrc_ext = jnp.zeros((model.nbody if reads.forces else 0, 6, qpos.shape[-1]), qpos.dtype)
         if not len(scene.limited) and not scene.groups:
-            return spatial.solve(s.mass, s.force), (torso, contact)
+            return spatial.solve(s.mass, s.force), (xpos, cfrc_ext)
         rows, met = contacts.constrain(scene, tree, s, qpos, qvel)
         solution = newton.solve(newton.Problem(s.mass, s.force, *rows), guess)
-        if contact_forces:
-            contact = contacts.contact_forces(scene, model, met, s.centre, solution.push)
-        return solution.acceleration, (torso, contact)
+        if reads.forces:
+            cfrc_ext = contacts.contact_forces(scene, model, met, s.centre, solution.push)
+        return solution.acceleration, (xpos, cfrc_ext)
 
     def substep(state: PhysicsState, ctrl: Array) -> PhysicsState:
         q, v = state.qpos, state.qvel
@@ -59,16 +62,16 @@ def jax_engine(spec: mujoco.MjSpec, frame_skip: int, *, contact_forces: bool = F
             return ((rate, acceleration), (sum_q + b * rate, sum_v + b * acceleration), seen), None
 
         # the first stage is at a = 0, so the accelerations before it only start the solver
-        first, zero = (jnp.zeros_like(v), state.warmstart), (jnp.zeros_like(v), jnp.zeros_like(v))
+        first, zero = (jnp.zeros_like(v), state.qacc_warmstart), (jnp.zeros_like(v), jnp.zeros_like(v))
         tableau = jnp.asarray(_STAGE, v.dtype), jnp.asarray(_WEIGHT, v.dtype)
-        ((_, warmstart), (dq, dv), seen), _ = jax.lax.scan(stage, (first, zero, (state.torso, state.contact)), tableau)
+        ((_, warmstart), (dq, dv), seen), _ = jax.lax.scan(stage, (first, zero, (state.xpos, state.cfrc_ext)), tableau)
         return PhysicsState(_integrate(q, h * dq, free), v + h * dv, warmstart, *seen)
 
     @jax.default_matmul_precision("highest")  # TF32 on GPUs is no physics
     def advance(state: PhysicsState, ctrl: Array) -> PhysicsState:
         return jax.lax.scan(lambda s, _: (substep(s, ctrl), None), state, None, length=frame_skip)[0]
 
-    return Physics(model, _of_one_world(_in_blocks(advance)), "jax", contact_forces)
+    return Physics(model, of_one_world(_in_blocks(advance)), "jax", reads)
 
 
 def _in_blocks(advance):
@@ -89,30 +92,6 @@ def _in_blocks(advance):
         return jax.tree.map(lambda x: jnp.moveaxis(x, 0, -2).reshape(*x.shape[1:-1], count * size)[..., :worlds], out)
 
     return blocks
-
-
-def _of_one_world(advance):
-    """A step of one world from one of many, whose last axis is the world. However it is vmapped, the worlds become one axis."""
-
-    @jax.custom_batching.custom_vmap
-    def many(state, ctrl):
-        return advance(state, ctrl)
-
-    @many.def_vmap
-    def _(size, batched, *args):
-        worlds = args[1].shape[-1]
-
-        def merge(x, has):
-            x = jnp.moveaxis(x, 0, -2) if has else jnp.repeat(x[..., None, :], size, -2)
-            return x.reshape(*x.shape[:-2], size * worlds)
-
-        out = many(*jax.tree.map(merge, args, tuple(batched)))
-        return jax.tree.map(lambda x: jnp.moveaxis(x.reshape(*x.shape[:-1], size, worlds), -2, 0), out), jax.tree.map(lambda _: True, out)
-
-    def step(state: PhysicsState, ctrl: Array) -> PhysicsState:
-        return jax.tree.map(lambda x: x[..., 0], many(*jax.tree.map(lambda x: x[..., None], (state, ctrl))))
-
-    return step
 
 
 def _integrate(qpos: Array, move: Array, free: bool) -> Array:

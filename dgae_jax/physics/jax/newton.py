@@ -25,32 +25,39 @@ class Problem(NamedTuple):
     """The quantities above, for W worlds: V degrees of freedom, C constraint rows."""
 
     mass: Float[Array, "V V W"]
+    """M, MuJoCo's `qM` in full."""
     force: Float[Array, "V W"]
-    """M a₀."""
+    """M a₀ = `qfrc_smooth`."""
     jacobian: Float[Array, "V C W"]
-    """Jᵀ."""
+    """Jᵀ, `efc_J` transposed."""
     stiffness: Float[Array, "C W"]
-    """D, the inverse of the regularisation; zero for a row that does not count."""
+    """D, `efc_D`; zero for a row that is not active."""
     reference: Float[Array, "C W"]
+    """a_ref, `efc_aref`."""
 
 
 class Solution(NamedTuple):
     """The optimum, and how it was reached."""
 
     acceleration: Float[Array, "V W"]
+    """`qacc`."""
     push: Float[Array, "C W"]
-    """The force along each row."""
+    """`efc_force`, the force along each row."""
     iterations: Int[Array, " W"]
+    """`solver_niter`."""
 
 
 class _Iterate(NamedTuple):
     a: Float[Array, "V W"]
+    """`qacc`."""
     r: Float[Array, "C W"]
     """J a − a_ref."""
     g: Float[Array, "V W"]
     """M (a − a₀)."""
     done: Bool[Array, " W"]
+    """Whether the world has converged."""
     n: Int[Array, " W"]
+    """Newton steps so far."""
 
 
 def solve(p: Problem, guess: Float[Array, "V W"]) -> Solution:

@@ -17,52 +17,62 @@ _PLANE, _CAPSULE = int(mujoco.mjtGeom.mjGEOM_PLANE), int(mujoco.mjtGeom.mjGEOM_C
 Numbers = np.ndarray | Array
 """Constants of the model, which become arrays where a world keeps only some contacts."""
 
+_CONTACTS = {("ant", 25): 8, ("walker2d", 14): 10}
+"""More contacts with the ground than the models of Gymnasium ever have at once, by the model's name and by how many are possible."""
+
 
 class Softness(NamedTuple):
-    """How each of K limits or contacts gives way."""
+    """The solver parameters of K limits or contacts."""
 
     margin: Numbers
+    """[K] `jnt_margin`, or the `margin` of a contact [m, rad]: a constraint acts below this distance."""
     inverse_weight: Numbers
+    """[K] `efc_diagApprox`: approximate inverse inertia along the row [1/kg, or per kg m²]."""
     stiffness: Numbers
-    """Of the reference acceleration [1/s²]."""
+    """[K] k of the reference acceleration, from `solref` [1/s²]."""
     damping: Numbers
-    """[1/s]."""
+    """[K] b of the reference acceleration, from `solref` [1/s]."""
     impedance: Numbers
-    """[K 5] MuJoCo's `solimp`."""
+    """[K 5] `solimp`: d_0, d_width, width, midpoint, power."""
 
 
 class Ends(NamedTuple):
-    """K points with a radius, fixed to frames."""
+    """K spheres or capsules, fixed to frames."""
 
     frame: np.ndarray
+    """[K] the joint's frame that the geom is fixed to."""
     centre: np.ndarray
-    """[K 3]."""
+    """[K 3] `geom_pos` in that frame [m]."""
     half: np.ndarray
-    """[K 3] half the axis of the capsule; zero for a sphere."""
+    """[K 3] half the axis of a capsule in that frame, `geom_size[1]` along z of `geom_quat` [m]; zero for a sphere."""
     radius: np.ndarray
+    """[K] `geom_size[0]` [m]."""
 
 
 class Touching(NamedTuple):
-    """The constants of K contacts that may happen."""
+    """The constants of K possible contacts."""
 
     softness: Softness
     friction: Numbers
+    """[K] sliding friction of `contact.friction` [1]."""
     moves: Numbers
     """[K V] how a degree of freedom moves the second body against the first: 1, 0 or −1."""
     bodies: Numbers
-    """[K 2]."""
+    """[K 2] `geom_bodyid` of `contact.geom`."""
 
 
 class Group(NamedTuple):
-    """Contacts that are found and kept in the same way."""
+    """Possible contacts that are found and kept in the same way."""
 
     touching: Touching
     first: Ends | None
-    """None for the ground."""
+    """The first of `contact.geom`; None for the ground, a plane."""
     second: Ends
+    """The second of `contact.geom`."""
     plane: np.ndarray
-    """[K 4] normal and offset of the ground."""
+    """[K 4] normal and offset of the ground [1, m]."""
     frictionless: bool
+    """Whether `contact.dim` is 1; it is 3 otherwise."""
     most: int
     """How many are kept, the nearest ones."""
 
@@ -71,10 +81,17 @@ class Scene(NamedTuple):
     """All that may constrain a tree."""
 
     limited: np.ndarray
-    """The joints with limits."""
+    """The joints with `jnt_limited`."""
     softness: Softness
-    """Of the limits."""
+    """Solver parameters of the limits."""
     groups: list[Group]
+    """The contacts."""
+
+
+def known_bound(name: str, model: mujoco.MjModel) -> int | None:
+    """The bound on contacts with the ground that is known for a model of this name; None where none is."""
+    ground = [two for one, two in _pairs(model) if model.geom_type[one] == _PLANE]
+    return _CONTACTS.get((name, sum(2 if model.geom_type[two] == _CAPSULE else 1 for two in ground)))
 
 
 def scene_of(tree: Tree, most: int | None = None) -> Scene:

@@ -1,0 +1,39 @@
+"""Environments of Brax's own under our trainer, and our tasks under Brax's.
+
+Importing this registers our tasks with Brax as `dgae_ant`, `dgae_hopper`, `dgae_swimmer` and `dgae_walker2d`, for Brax's own
+trainers: `brax.envs.get_environment("dgae_hopper", physics="jax")`.
+"""
+
+import warnings
+from functools import partial
+
+import brax.envs
+import jax.numpy as jnp
+from brax.envs.base import Env, Wrapper
+from jaxtyping import Array, Float
+
+from dgae_jax.envs.registry import BRAX, TASKS, make_env
+from dgae_jax.physics.quiet import silenced
+
+
+class BraxTask(Wrapper):
+    """An environment of Brax's own, whose actions lie in [−1, 1]."""
+
+    @property
+    def action_range(self) -> tuple[Float[Array, " A"], Float[Array, " A"]]:
+        """The lowest and highest action."""
+        return -jnp.ones(self.action_size), jnp.ones(self.action_size)
+
+
+def make(name: str, physics: str, version: None, **parameters) -> Env:
+    """The environment that Brax calls `name`, on Brax's MJX backend; raises ValueError where Brax cannot build it."""
+    try:
+        with warnings.catch_warnings(), silenced():
+            warnings.simplefilter("ignore")  # Brax speaks of features of its model files that it leaves out
+            return BraxTask(brax.envs.get_environment(name, backend=physics, **parameters))
+    except (ValueError, TypeError) as reason:
+        raise ValueError(f"environment {BRAX}{name}: must be one that Brax can build on {physics} ({reason})") from None
+
+
+for _name in TASKS:
+    brax.envs.register_environment(f"dgae_{_name}", partial(make_env, _name))  # pyright: ignore[reportArgumentType]

@@ -1,0 +1,36 @@
+"""MuJoCo's warnings, counted instead of printed: left alone, each goes to stderr and to MUJOCO_LOG.TXT in the working directory."""
+
+import contextlib
+import logging
+from collections import Counter
+
+import mujoco
+import numpy as np
+
+_LOG = logging.getLogger(__name__)
+
+COUNTS: Counter[str] = Counter()
+"""How often C MuJoCo warned in this process while `native` stepped, by MuJoCo's name of the warning."""
+
+KINDS = tuple(mujoco.mjtWarning(i).name.removeprefix("mjWARN_") for i in range(int(mujoco.mjtWarning.mjNWARNING)))
+"""BADQACC, CONTACTFULL, …: in MuJoCo's order."""
+
+
+@contextlib.contextmanager
+def silenced():
+    """Within it, MuJoCo's warnings from any thread are neither printed nor written to a file."""
+    before = mujoco.get_mju_user_warning()
+    mujoco.set_mju_user_warning(lambda message: None)
+    try:
+        yield
+    finally:
+        mujoco.set_mju_user_warning(before)
+
+
+def count(numbers: np.ndarray) -> None:
+    """Add new warnings, one number per kind; the first of each kind is said in one line, the others only counted."""
+    for kind, number in zip(KINDS, numbers, strict=True):
+        if number and kind not in COUNTS:
+            _LOG.warning("MuJoCo warns of %s in physics native; from now on its warnings are counted, not shown", kind)
+        if number:
+            COUNTS[kind] += int(number)

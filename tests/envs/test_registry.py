@@ -1,0 +1,86 @@
+"""The table of tasks, and Brax on either side of it."""
+
+import brax.envs
+import jax
+import jax.numpy as jnp
+import pytest
+from numpy.testing import assert_array_equal
+
+import dgae_jax as dg
+import dgae_jax.envs.brax
+from dgae_jax.envs.registry import BRAX_NAMES, TASKS, spec_of
+from dgae_jax.physics.registry import ENGINES
+
+
+@pytest.mark.parametrize("name", TASKS)
+def test_our_tasks_run_on_every_engine_and_gymnasium_evaluates_them(name):
+    spec = spec_of(name)
+    assert spec.engines == tuple(ENGINES)
+    assert spec.choose() == ("jax", "v4")
+    assert spec.choose("native", "v5") == ("native", "v5")
+    assert spec.referee("v5").lower() == f"{name}-v5"
+
+
+def test_braxs_own_tasks_run_on_mjx_and_evaluate_themselves():
+    spec = spec_of("brax:ant")
+    assert spec.engines == ("mjx",)
+    assert spec.choose() == ("mjx", None)
+    assert spec.versions == ()
+    assert spec.referee() is None
+
+
+@pytest.mark.parametrize("name", ["hoper", "brax:", "brax:nope", "brax:swimmer", "brax:dgae_ant", ""])
+def test_an_unknown_task_is_refused_with_what_exists(name):
+    with pytest.raises(ValueError, match=r"^one of ant, hopper, swimmer, walker2d, or brax:NAME with NAME one of ant, fast"):
+        spec_of(name)
+    with pytest.raises(ValueError, match=f"^environment {name}: must be one of ant"):
+        dg.make_env(name)
+
+
+@pytest.mark.parametrize(
+    ("name", "options", "allowed"),
+    [
+        ("hopper", {"physics": "bullet"}, "physics bullet: must be one of jax, mjx, mjx-warp, native"),
+        ("hopper", {"version": "v9"}, "version v9: must be one of v4, v5"),
+        ("brax:ant", {"physics": "native"}, "physics native: must be one of mjx"),
+        ("brax:ant", {"version": "v4"}, "version v4: must be left out"),
+        ("brax:ant", {"feet": 4}, "environment brax:ant: must be one that Brax can build on mjx .*feet"),
+    ],
+)
+def test_what_a_task_does_not_have_is_refused_with_what_it_has(name, options, allowed):
+    with pytest.raises(ValueError, match=f"^{allowed}"):
+        dg.make_env(name, **options)
+
+
+def test_the_names_of_braxs_own_are_those_that_brax_builds_on_mjx():
+    own = {name for name in brax.envs._envs if not name.startswith("dgae_")}
+    assert own == {*BRAX_NAMES, "swimmer"}
+    with pytest.warns(UserWarning, match="not actively"), pytest.raises(ValueError, match="Unsupported backend"):
+        brax.envs.get_environment("swimmer", backend="mjx")
+    for name in BRAX_NAMES:
+        assert dg.make_env(f"brax:{name}").action_size > 0
+
+
+def test_an_environment_registered_with_brax_is_known_too(monkeypatch):
+    monkeypatch.setitem(brax.envs._envs, "mine", brax.envs._envs["inverted_pendulum"])
+    assert spec_of("brax:mine").arguments == ("mine",)
+
+
+def test_an_environment_of_braxs_own_takes_our_trainers_contract():
+    env = dg.make_env("brax:inverted_pendulum")
+    low, high = env.action_range
+    assert_array_equal(low, [-1])
+    assert_array_equal(high, [1])
+    assert jnp.isfinite(jax.jit(env.reset)(jax.random.key(0)).obs).all()
+
+
+def test_building_an_environment_of_braxs_own_prints_nothing_and_writes_no_file(monkeypatch, tmp_path, capfd):
+    monkeypatch.chdir(tmp_path)
+    dg.make_env("brax:halfcheetah")
+    assert capfd.readouterr() == ("", "")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_brax_finds_our_tasks_by_name():
+    env = brax.envs.get_environment("dgae_swimmer", physics="native")
+    assert env.observation_size == 8
