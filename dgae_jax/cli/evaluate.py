@@ -13,7 +13,7 @@ from dgae_jax.cli.arguments import fail, parse
 from dgae_jax.run import directory, files, machine, terminal
 from dgae_jax.run.checkpoint import CheckpointError
 from dgae_jax.run.evaluation import default_path, engines_of, evaluate_run
-from dgae_jax.run.options import RunOptions
+from dgae_jax.run.options import WHOLE, RunOptions
 from dgae_jax.run.progress import Reporter
 from dgae_jax.run.summary import describe
 
@@ -42,8 +42,9 @@ class Arguments:
 def main() -> int:
     """Evaluate one run directory; 0 done, 2 bad input, 130 stopped by SIGINT."""
     arguments = parse(Arguments, "Evaluate the deterministic policy of a trained run.")
-    if arguments.episodes < 1:
-        fail(f"--episodes {arguments.episodes}: must be a whole number of at least 1")
+    low, high, reason = WHOLE["episodes"]
+    if not low <= arguments.episodes <= high:
+        fail(f"--episodes {arguments.episodes}: must be a whole number from {low:,} to {high:,} ({reason})")
     if not 0 <= arguments.seed < 2**31:
         fail(f"--seed {arguments.seed}: must be a whole number from 0 to {2**31 - 1:,}")
     if arguments.out and not arguments.out.absolute().parent.is_dir():

@@ -3,6 +3,7 @@
 import re
 from collections.abc import Iterator, Sequence
 from dataclasses import fields, is_dataclass
+from itertools import pairwise
 from typing import Any, get_type_hints
 
 from dgae_jax.configs.algorithms import TABLE
@@ -50,6 +51,9 @@ def understood(argv: Sequence[str]) -> list[str]:
     out: list[str] = []
     for before, word in zip(["", *words], words, strict=False):
         out += _value(before[2:].replace("_", "-"), word) if before.startswith("--") else [word]
+    versions = {value for name, value in pairwise(out) if name.replace("_", "-") == flag("env_version")}
+    if len(versions) > 1:
+        raise ConfigError(f"--env-version: must be one, not {' and '.join(sorted(versions))}")
     return out
 
 

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from dgae_jax.configs.config import ConfigError, flag
+from dgae_jax.configs.config import ConfigError, invalid
 
 
 @dataclass(frozen=True)
@@ -33,12 +33,21 @@ class RunOptions:
     """Write the state and action of worlds that turn non-finite to nonfinite/ in the run directory, for replay."""
 
 
+WHOLE = {
+    "checkpoint_every": (1, 2**31 - 1, "samples are counted in an int32"),
+    "keep_checkpoints": (1, 1_000_000, "files in one directory"),
+    "max_nonfinite": (1, 2**31 - 1, "iterations are counted in an int32"),
+    "episodes": (1, 10_000, "they are played side by side"),
+}
+"""Whole numbers: from, to, and why not more."""
+
+
 def validate_options(options: RunOptions) -> None:
-    """Raise `ConfigError` for the first option that cannot be."""
-    for name in ("checkpoint_every", "keep_checkpoints", "max_nonfinite", "episodes"):
+    """Raise `ConfigError` for the first option that is invalid."""
+    for name, (low, high, reason) in WHOLE.items():
         value = getattr(options, name)
-        if value < 1:
-            raise ConfigError(f"{flag(name)} {value}: must be a whole number of at least 1")
+        if not low <= value <= high:
+            raise invalid(name, value, f"a whole number from {low:,} to {high:,} ({reason})")
     if options.resume is not None and options.run_dir is not None:
         raise ConfigError(f"--run-dir {options.run_dir}: must be left out: --resume writes to {options.resume}")
     if options.resume is not None and options.resume_or_start:

@@ -10,7 +10,8 @@ import time
 
 import pytest
 
-from dgae_jax.run import metrics
+from dgae_jax.cli.train import parsed
+from dgae_jax.run import directory, metrics
 from tests.helpers import ROOT, TINY, command
 
 
@@ -118,20 +119,16 @@ def test_evaluating_twice_gives_the_same_returns(trained, run, tmp_path):
         (["--policy.clp", "3"], r"Unrecognized options: --policy.clp, 3 Perhaps you meant: --policy.clip"),
         (["--num-envs", "many"], r"--num-envs: invalid literal for int\(\) with base 10: 'many'"),
         (["--num-envs"], r"--num-envs"),
-        (["--num-envs", "0"], r"--num-envs 0: must be a whole number of at least 1"),
-        (["--env", "hoper"], r"--env hoper: must be one of ant, hopper, swimmer, walker2d"),
-        (["--algo", "sac"], r"--algo sac: must be one of ppo, dppo"),
-        (["--gamma", "1.5"], r"--gamma 1.5: must be a number from 0 to 1"),
-        (["--lam", "-1"], r"--lam -1.0: must be a number from 0 to 1"),
         (["--policy.minibatches", "7"], r"--policy.minibatches 7: must be a divisor of num_envs \* horizon = 2,048"),
-        (["--total-steps", "2000"], r"--total-steps 2000: must be at least one iteration of num_envs \* horizon = 2,048 samples"),
+        (["--env", "hoper"], r"--env hoper: must be one of ant, hopper, swimmer, walker2d"),
         (["--run-dir", "/dev/null/below"], r"--run-dir /dev/null/below: must be a directory that can be written"),
         (["--cache-dir", "/dev/null/below"], r"--cache-dir /dev/null/below: must be a directory that can be written, or none"),
-        (["--episodes", "0"], r"--episodes 0: must be a whole number of at least 1"),
-        (["--checkpoint-every", "0"], r"--checkpoint-every 0: must be a whole number of at least 1"),
-        (["--keep-checkpoints", "0"], r"--keep-checkpoints 0: must be a whole number of at least 1"),
-        (["--num-seeds", "0"], r"--num-seeds 0: must be a whole number of at least 1"),
+        (["--episodes", "0"], r"--episodes 0: must be a whole number from 1 to 10,000"),
+        (["--checkpoint-every", "0"], r"--checkpoint-every 0: must be a whole number from 1 to"),
         (["--inexact"], r"--inexact True: must be left out without --resume"),
+        (["--num-envs", "1e9", "--horizon", "1", "--policy.minibatches", "1", "--critic.minibatches", "1", "--total-steps", "1e9"],
+         r"--num-envs 1000000000: must be smaller: the run needs at least [\d,.]+ GiB of memory, and there are [\d.,]+ GiB"),
+        (["--policy.hidden", *["8"] * 1000], r"--policy.hidden of 1,000 layers: must be at most 32"),
     ],
 )  # fmt: skip
 def test_bad_input_is_one_line_on_stderr_and_exit_code_2(argv, message, run, monkeypatch, tmp_path):
@@ -156,6 +153,7 @@ def test_a_used_run_directory_is_refused_and_left_alone(trained, run):
     [
         (["--resume", "RUN", "--preset", "paper"], r"--preset paper: must be left out: all settings start from RUN"),
         (["--resume", "RUN", "--config", "FILE"], r"--config FILE: must be left out: all settings start from RUN"),
+        (["--config", "FILE", "--algo", "ppo"], r"--algo ppo: must be dppo as in FILE, or left out"),
         (["--config", "FILE", "--preset", "paper"], r"--preset paper: must be left out: all settings start from FILE"),
         (["--resume", "RUN", "--run-dir", "there"], r"--run-dir there: must be left out: --resume writes to RUN"),
         (["--resume", "RUN", "--gamma", "0.5"], r"--gamma 0\.5: must be 0\.99 as in RUN, or left out"),
@@ -171,6 +169,36 @@ def test_flags_that_would_have_no_effect_are_refused(argv, message, trained, run
     assert re.fullmatch(rf"error: {message}\n", err)
 
 
+def test_a_mistake_is_refused_before_jax_mujoco_and_brax_are_imported():
+    code = """
+import sys
+from dgae_jax.cli.train import main
+sys.argv = ["train", "--gamma", "1.5"]
+try:
+    main()
+except SystemExit as stop:
+    print(stop.code, [name for name in ("jax", "mujoco", "brax", "flax", "gymnasium", "matplotlib") if name in sys.modules])
+"""
+    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True)
+    assert (done.stdout, done.stderr) == ("2 []\n", "error: --gamma 1.5: must be a number from 0 to 1\n")
+
+
+def test_dgae_runs_a_command_by_name_and_names_them_all(monkeypatch, capsys):
+    def dgae(*argv):
+        monkeypatch.setattr(sys, "argv", ["dgae", *argv])
+        try:
+            code = command("main")()
+        except SystemExit as stop:
+            code = stop.code
+        return code, *capsys.readouterr()
+
+    assert dgae("evaluate", "--episodes", "0", ".")[::2] == (2, "error: --episodes 0: must be a whole number from 1 to 10,000\n")
+    assert dgae("trian") == (2, "", "error: trian: must be one of train, evaluate\n")
+    code, out, err = dgae("--help")
+    assert (code, err) == (0, "")
+    assert all(re.search(rf"^  {name} ", out, re.MULTILINE) for name in ("train", "evaluate"))
+
+
 def test_a_device_that_is_not_there_is_refused_in_one_line(tmp_path):
     done = subprocess.run(
         [sys.executable, "experiments/train.py", "--run-dir", str(tmp_path / "run")], cwd=ROOT, capture_output=True, text=True,
@@ -181,7 +209,7 @@ def test_a_device_that_is_not_there_is_refused_in_one_line(tmp_path):
     assert not (tmp_path / "run").exists()
 
 
-@pytest.mark.parametrize(("name", "work"), [("train", "train"), ("evaluate", "evaluate_run")])
+@pytest.mark.parametrize(("name", "work"), [("train", "parsed"), ("evaluate", "parse")])
 def test_an_interrupt_where_nothing_is_at_stake_ends_with_130_and_one_line(name, work, trained, run, monkeypatch, tmp_path):
     def interrupted(*_, **__):
         raise KeyboardInterrupt
@@ -194,12 +222,10 @@ def test_an_interrupt_where_nothing_is_at_stake_ends_with_130_and_one_line(name,
     assert re.fullmatch(r"stopped by SIGINT.*\n", err)
 
 
-def test_a_resumed_run_starts_from_its_own_flags(trained, monkeypatch):
-    main, got = command("train"), []
-    monkeypatch.setitem(main.__globals__, "resume", lambda config, options: got.append(options) or 0)
-    monkeypatch.setattr(sys, "argv", ["train.py", "--resume", str(trained[0]), "--episodes", "5"])
-    assert main() == 0
-    assert (got[0].checkpoint_every, got[0].episodes, got[0].keep_checkpoints) == (300, 5, 3)
+def test_a_resumed_run_starts_from_its_own_flags(trained):
+    config, options = parsed(["--resume", str(trained[0]), "--episodes", "5"])
+    assert config == directory.read_config(trained[0])
+    assert (options.checkpoint_every, options.episodes, options.keep_checkpoints) == (300, 5, 3)
 
 
 def test_an_output_that_is_no_file_is_left_alone(trained, run, tmp_path):

@@ -1,0 +1,42 @@
+"""What the documents print is run as it stands there."""
+
+import re
+
+import pytest
+
+from dgae_jax.configs.algorithms import TABLE
+from dgae_jax.configs.parts import UPDATES
+from dgae_jax.maths.risk import METRICS
+from tests.helpers import ROOT
+
+DOCUMENTS = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+BLOCKS = [
+    pytest.param(block, id=f"{path.name}:{text[: text.index(block)].count(chr(10)) + 1}")
+    for path in DOCUMENTS
+    for text in [path.read_text()]
+    for block in re.findall(r"^```python\n(.*?)^```", text, re.MULTILINE | re.DOTALL)
+]
+
+
+@pytest.mark.parametrize("block", BLOCKS)
+def test_a_block_of_code_runs_as_it_is_printed(block, monkeypatch, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    tables = [(table, dict(table)) for table in (TABLE, UPDATES, METRICS)]
+    try:
+        exec(compile(block, "document", "exec"), {"__name__": "document"})
+    finally:
+        for table, before in tables:
+            table.clear()
+            table.update(before)
+
+
+@pytest.mark.parametrize("path", DOCUMENTS, ids=lambda path: path.name)
+def test_links_between_documents_lead_somewhere(path):
+    for target in re.findall(r"\]\((?!https?:)([^)#]+)", path.read_text()):
+        assert (path.parent / target).exists(), target
+
+
+@pytest.mark.parametrize("path", DOCUMENTS, ids=lambda path: path.name)
+def test_modules_that_documents_name_exist(path):
+    for name in re.findall(r"`((?:dgae_jax|experiments|benchmarks|tests|docs)/[\w/]+\.\w+)`", path.read_text()):
+        assert (ROOT / name).exists(), name

@@ -1,0 +1,34 @@
+"""The house as its plans say: rooms, sizes, and what imports what."""
+
+import ast
+import re
+import tomllib
+
+import pytest
+
+from tests.helpers import ROOT
+
+MODULES = sorted((ROOT / "dgae_jax").rglob("*.py"))
+TESTS = sorted((ROOT / "tests").rglob("*.py"))
+ROOMS = [
+    room.removeprefix("dgae_jax.")
+    for room in tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["importlinter"]["contracts"][0]["layers"]
+]
+
+
+def test_the_rooms_are_the_folders_of_the_package_and_the_readme_lists_them_in_order():
+    folders = {path.name for path in (ROOT / "dgae_jax").iterdir() if path.is_dir() and path.name != "__pycache__"}
+    assert folders == set(ROOMS)
+    assert re.findall(r"^    (\w+)/ ", (ROOT / "README.md").read_text(), re.MULTILINE) == ROOMS
+
+
+@pytest.mark.parametrize("path", MODULES, ids=lambda path: str(path.relative_to(ROOT)))
+def test_a_module_has_a_docstring_and_at_most_250_lines(path):
+    text = path.read_text()
+    assert ast.get_docstring(ast.parse(text))
+    assert text.count("\n") <= 250
+
+
+def test_no_test_imports_another_test_file():
+    for path in TESTS:
+        assert not re.search(r"^(from|import) tests\S*\.test_|^from tests\S* import test_", path.read_text(), re.MULTILINE), path
