@@ -115,7 +115,7 @@ def _fresh_worlds(config: Config, seed: int, episodes: int, progress: _Progress)
     numbers = [np.random.SeedSequence((seed, i)).generate_state(config.num_seeds) for i in range(batches)]
     keys = [jnp.stack([jax.random.key(int(n)) for n in each]) for each in numbers]
     compile_aside(init, config, keys[0], watch=progress.watch, what=f"{progress.what}: compiling resets")
-    worlds = [jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), init(config, each).episodes.env) for each in keys]
+    worlds = [jax.tree.map(lambda x: x.reshape(x.shape[0] * x.shape[1], *x.shape[2:]), init(config, each).episodes.env) for each in keys]
     return jax.tree.map(lambda *parts: jnp.concatenate(parts)[:episodes], *worlds)
 
 
