@@ -16,7 +16,7 @@ import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
-from dgae_jax.configs.config import Config, ConfigError
+from dgae_jax.configs.config import Config, ConfigError, invalid
 from dgae_jax.configs.serial import from_dict, to_dict
 from dgae_jax.configs.validation import validate
 from dgae_jax.run import files, manifest, terminal
@@ -35,23 +35,33 @@ def create(path: Path, config: Config, options: RunOptions) -> None:
     In a directory that exists and is empty `config.json` is written last: without it the directory still counts as empty.
     Raises ConfigError, and writes nothing, if the directory holds anything else or cannot be written.
     """
-    refusal = ConfigError(f"--run-dir {path}: must be a new or empty directory")
     try:
         if path.exists():
             if not _is_empty(path):
-                raise refusal
+                raise _used(path)
             _fill(path, config, options)
             return
         path.parent.mkdir(parents=True, exist_ok=True)
         _clean(path)
         with _sibling(path) as sibling:
             _fill(sibling, config, options)
-            sibling.rename(path)
+            _move(sibling, path)
         files.sync_directory(path.parent)
     except OSError as reason:
+        raise invalid("run_dir", path, f"a directory that can be written ({reason.strerror})") from reason
+
+
+def _used(path: Path) -> ConfigError:
+    return invalid("run_dir", path, "a new or empty directory")
+
+
+def _move(made: Path, path: Path) -> None:
+    try:
+        made.rename(path)
+    except OSError as reason:
         if reason.errno in (errno.ENOTEMPTY, errno.EEXIST):  # another process was quicker
-            raise refusal from reason
-        raise ConfigError(f"--run-dir {path}: must be a directory that can be written ({reason.strerror})") from reason
+            raise _used(path) from reason
+        raise
 
 
 def has_begun(path: Path) -> bool:

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from dgae_jax.configs.build import Fitted, make_greedy, make_task, make_trainer
-from dgae_jax.configs.config import Config, ConfigError
+from dgae_jax.configs.config import Config, invalid
 from dgae_jax.envs.registry import spec_of
 from dgae_jax.learn import play
 from dgae_jax.learn.parallel import Trainer
@@ -84,7 +84,7 @@ def evaluate_policies(
 
 def _check_engine(config: Config, engine: str | None) -> None:
     if engine is not None and engine not in engines_of(config):
-        raise ConfigError(f"--engine {engine}: must be one of {', '.join(engines_of(config))} with {config.env}")
+        raise invalid("engine", engine, f"one of {', '.join(engines_of(config))} with {config.env}")
 
 
 class _Progress(NamedTuple):
@@ -117,7 +117,7 @@ def _fresh_worlds(config: Config, seed: int, episodes: int, progress: _Progress)
     numbers = [np.random.SeedSequence((seed, i)).generate_state(config.num_seeds) for i in range(batches)]
     keys = [jnp.stack([jax.random.key(int(n)) for n in each]) for each in numbers]
     compile_aside(init, config, keys[0], watch=progress.watch, what=f"{progress.what}: compiling resets")
-    worlds = [jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), init(config, each).episodes.env) for each in keys]
+    worlds = [jax.tree.map(lambda x: x.reshape(x.shape[0] * x.shape[1], *x.shape[2:]), init(config, each).episodes.env) for each in keys]
     return jax.tree.map(lambda *parts: jnp.concatenate(parts)[:episodes], *worlds)
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from dgae_jax.configs.build import make_task
-from dgae_jax.configs.config import Config, ConfigError, flag
+from dgae_jax.configs.config import Config, ConfigError, invalid
 from dgae_jax.configs.memory import check_memory
 from dgae_jax.configs.serial import MAY_CHANGE, differences
 from dgae_jax.configs.validation import validate
@@ -105,10 +105,10 @@ def _compare(config: Config, saved: Config, run_dir: Path, inexact: bool) -> Non
     changed = differences(config, saved)
     for path, (ours, theirs) in changed.items():
         if path not in MAY_CHANGE or (path == "physics" and not inexact):
-            raise ConfigError(f"{flag(path)} {ours}: must be {theirs} as in {run_dir}, or left out")
+            raise invalid(path, ours, f"{theirs} as in {run_dir}, or left out")
     elsewhere = "; ".join(manifest.changes(run_dir))
     if elsewhere and not inexact:
-        raise ConfigError(f"--resume {run_dir}: must go on where it began, or with --inexact; now {elsewhere}")
+        raise ConfigError(f"resume {run_dir}: must go on where it began, or with --inexact; now {elsewhere}", "resume")
     if "physics" in changed:
         ours, theirs = changed["physics"]
         _warn_of_another_sample(f"physics {ours} (was {theirs}): one step differs by up to 1e-4")
@@ -130,6 +130,6 @@ def _last_state(run_dir: Path, config: Config) -> TrainState | None:
     state, path = restore.training_state(run_dir, config)
     done = config.samples_per_iteration * int(state.iteration[0])
     if config.total_steps < done:
-        raise ConfigError(f"--total-steps {config.total_steps}: must be at least the {done} that are done in {run_dir}")
+        raise invalid("total_steps", config.total_steps, f"at least the {done} that are done in {run_dir}")
     terminal.say(f"resuming from {path.name}")
     return state

@@ -7,7 +7,7 @@ from typing import Any
 
 import jax
 
-from dgae_jax.configs.config import Config, ConfigError
+from dgae_jax.configs.config import Config, ConfigError, invalid
 from dgae_jax.run import terminal
 
 _SETTINGS = ("jax_enable_x64", "jax_default_prng_impl", "jax_threefry_partitionable", "jax_default_matmul_precision")
@@ -38,7 +38,7 @@ def use_cache(cache_dir: str) -> None:
         path = Path(cache_dir).expanduser()
         path.mkdir(parents=True, exist_ok=True)
     except (OSError, RuntimeError) as reason:
-        raise ConfigError(f"--cache-dir {cache_dir}: must be a directory that can be written, or none ({reason})") from reason
+        raise invalid("cache_dir", cache_dir, f"a directory that can be written, or none ({reason})") from reason
     jax.config.update("jax_compilation_cache_dir", str(path))
 
 

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from dgae_jax.configs.config import ConfigError, invalid
+from dgae_jax.configs.config import invalid
 
 
 @dataclass(frozen=True)
@@ -49,13 +49,13 @@ def validate_options(options: RunOptions) -> None:
         if not low <= value <= high:
             raise invalid(name, value, f"a whole number from {low:,} to {high:,} ({reason})")
     if options.resume is not None and options.run_dir is not None:
-        raise ConfigError(f"--run-dir {options.run_dir}: must be left out: --resume writes to {options.resume}")
+        raise invalid("run_dir", options.run_dir, f"left out: --resume writes to {options.resume}")
     if options.resume is not None and options.resume_or_start:
-        raise ConfigError("--resume-or-start True: must be left out: --resume only resumes")
+        raise invalid("resume_or_start", True, "left out: --resume only resumes")
     if options.resume_or_start and options.run_dir is None:
-        raise ConfigError("--resume-or-start True: must come with the directory to look in, --run-dir DIR")
+        raise invalid("resume_or_start", True, "used with the directory to look in, --run-dir DIR")
     if options.inexact and options.resume is None and not options.resume_or_start:
-        raise ConfigError("--inexact True: must be left out without --resume")
+        raise invalid("inexact", True, "left out without --resume")
 
 
 _KEPT = ("checkpoint_every", "keep_checkpoints", "max_nonfinite", "episodes", "debug_nonfinite")

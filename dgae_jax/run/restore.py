@@ -8,7 +8,7 @@ from typing import Any, NamedTuple, TypeVar
 import jax
 
 from dgae_jax.configs.build import Fitted, make_task, make_trainer, seed_keys
-from dgae_jax.configs.config import Config, ConfigError
+from dgae_jax.configs.config import Config
 from dgae_jax.configs.serial import MAY_CHANGE, differences
 from dgae_jax.learn.types import TrainState
 from dgae_jax.run import checkpoint, terminal
@@ -43,12 +43,12 @@ def trained(run_dir: Path, config: Config, which: str) -> Trained:
     Raises ConfigError if the best is asked for and nothing was evaluated, CheckpointError as `training_state`.
     """
     if which not in CHOICES:
-        raise ConfigError(f"--checkpoint {which}: must be one of {', '.join(CHOICES)}")
+        raise invalid("checkpoint", which, f"one of {', '.join(CHOICES)}")
     if which == "newest":
         return _newest(run_dir, partial(_load_networks, config=config))[0]
     steps = EvaluationsFile(run_dir / "evaluations.jsonl").best
     if steps is None:
-        raise ConfigError(f"--checkpoint {which}: must be newest: {run_dir} has no evaluations")
+        raise invalid("checkpoint", which, f"newest: {run_dir} has no evaluations")
     return _load_networks(run_dir / "checkpoints" / checkpoint.name_of(steps), config)
 
 

@@ -96,6 +96,7 @@ def _iterate(config: Config, options: RunOptions, record: Record, signals: Signa
                 break
             if due and done < config.iterations:
                 _look(record, state, signals, reporter)
+                stopping = bool(signals.received)  # all is saved
     return state
 
 

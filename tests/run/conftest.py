@@ -1,0 +1,41 @@
+"""A state, a finished run and a copy of it."""
+
+import dataclasses
+import shutil
+from functools import cache
+
+import pytest
+
+from dgae_jax.configs.build import make_task, make_trainer, seed_keys
+from dgae_jax.run import training
+from dgae_jax.run.loop import train
+from tests.helpers import SMALL
+from tests.runs import QUIET, small
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _compiled_once():
+    """Runs of the same configuration share their program, which JAX does not keep for `native`."""
+    with pytest.MonkeyPatch.context() as patch:
+        for make in (training.make_task, training.make_trainer):
+            patch.setattr(training, make.__name__, cache(make))
+        yield
+
+
+@pytest.fixture(scope="session")
+def state():
+    return make_trainer(make_task(SMALL), 1).init(SMALL, seed_keys(SMALL))
+
+
+@pytest.fixture(scope="session")
+def finished(tmp_path_factory):
+    run_dir = tmp_path_factory.mktemp("runs") / "finished"
+    train(small(), dataclasses.replace(QUIET, run_dir=run_dir))
+    return run_dir
+
+
+@pytest.fixture
+def run_dir(finished, tmp_path):
+    """A copy of the finished run."""
+    shutil.copytree(finished, tmp_path / "run")
+    return tmp_path / "run"

@@ -1,0 +1,97 @@
+"""What ends a run early, and what is left of it."""
+
+import contextlib
+import dataclasses
+import resource
+import shutil
+import signal
+
+import jax.numpy as jnp
+import pytest
+
+from dgae_jax.run import directory, metrics, restore
+from dgae_jax.run import record as record_module
+from dgae_jax.run.loop import resume, train
+from dgae_jax.run.record import Record
+from tests.helpers import SMALL
+from tests.runs import QUIET, last, small, timeless
+
+
+@pytest.mark.parametrize("evaluation", [1, 2])
+@pytest.mark.parametrize(("kind", "code"), [(signal.SIGTERM, 143), (signal.SIGINT, 130)])
+def test_a_signal_in_an_evaluation_breaks_it_off_and_the_run_goes_on_later_to_the_same_end(
+    kind, code, evaluation, finished, tmp_path, capsys
+):
+    run_dir, config, calls = tmp_path / "run", small(), []
+
+    def interrupted(*args, **how):
+        calls.append(how)
+        if len(calls) == evaluation:
+            signal.raise_signal(kind)
+            pytest.fail("the evaluation went on")
+        return honest(*args, **how)
+
+    honest = record_module.evaluate_policies
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(record_module, "evaluate_policies", interrupted)
+        assert train(config, dataclasses.replace(QUIET, run_dir=run_dir)) == code
+    assert f"stopped by {kind.name}; continue with --resume {run_dir}" in capsys.readouterr().out
+    assert len(calls) == evaluation
+    assert not (run_dir / "evaluation.json").exists()
+    assert resume(config, dataclasses.replace(QUIET, resume=run_dir)) == 0
+    assert last(run_dir).read_bytes() == last(finished).read_bytes()
+    assert timeless(run_dir) == timeless(finished)
+    assert (run_dir / "evaluations.jsonl").read_bytes() == (finished / "evaluations.jsonl").read_bytes()
+
+
+def test_a_directory_that_vanishes_while_it_trains_ends_the_run_in_one_line(tmp_path, capsys):
+    run_dir, honest = tmp_path / "run", Record.append
+
+    def append(record, *args):
+        if record.steps == 64:  # no checkpoint yet, nothing on its way
+            shutil.rmtree(run_dir)
+        return honest(record, *args)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Record, "append", append)
+        assert train(small(), dataclasses.replace(QUIET, run_dir=run_dir)) == 1
+    error = f"stopped: {run_dir}/metrics.jsonl: cannot be written (No such file or directory); there is no checkpoint\n"
+    assert capsys.readouterr().err == error
+    assert not run_dir.exists()
+
+
+@contextlib.contextmanager
+def no_file_larger_than(size):
+    """The operating system refuses to write more, as on a full disk."""
+    usual = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, usual[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, usual)
+
+
+@pytest.mark.parametrize(("name", "share"), [("checkpoints/steps_000000000256.msgpack", 0.9), ("curve.png", 1.1)])
+def test_a_disk_that_takes_no_more_ends_the_run_in_one_line_and_it_goes_on_later_to_the_same_end(name, share, finished, tmp_path, capsys):
+    run_dir, size = tmp_path / "run", last(finished).stat().st_size
+    assert (finished / "metrics.jsonl").stat().st_size < 0.9 * size < 1.1 * size < (finished / "curve.png").stat().st_size
+    with no_file_larger_than(int(share * size)):
+        assert train(small(), dataclasses.replace(QUIET, run_dir=run_dir)) == 1
+    left = f"continue from {last(run_dir).name} with --resume {run_dir}" if share > 1 else "there is no checkpoint"
+    assert capsys.readouterr().err == f"stopped: {run_dir}/{name}: cannot be written (File too large); {left}\n"
+    assert not list(run_dir.rglob("*.part"))
+    assert resume(small(), dataclasses.replace(QUIET, resume=run_dir)) == 0
+    assert last(run_dir).read_bytes() == last(finished).read_bytes()
+    assert timeless(run_dir) == timeless(finished)
+
+
+def test_updates_that_are_not_finite_are_left_out_and_counted_and_end_the_run_when_there_is_no_other(tmp_path, capsys):
+    broken = dataclasses.replace(small(), policy=dataclasses.replace(SMALL.policy, learning_rate=1e30, max_grad_norm=1e30))
+    options = dataclasses.replace(QUIET, run_dir=tmp_path / "run", max_nonfinite=3)
+    assert train(broken, options) == 1
+    assert "updates were not finite and were left out" in capsys.readouterr().err
+    rows = metrics.read(tmp_path / "run" / "metrics.jsonl")
+    assert sum(row["skipped"] for row in rows) >= 3
+    state, _ = restore.training_state(tmp_path / "run", directory.read_config(tmp_path / "run"))
+    assert all(jnp.isfinite(x).all() for fit in (state.policy, state.critic) for x in fit.params["params"]["Dense_0"].values())
+    assert not (tmp_path / "run" / "evaluation.json").exists()
