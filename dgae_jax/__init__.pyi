@@ -1,5 +1,7 @@
-from .configs.build import Config, ConfigError, CriticConfig, NoiseConfig, PolicyConfig, make_algorithm, make_train
+from .configs.build import make_algorithm, make_train
+from .configs.config import ConfigError, NoiseConfig
 from .configs.presets import preset
+from .configs.pytree import Config, CriticConfig, PolicyConfig
 from .envs.registry import make_env
 from .maths.returns import (
     bellman_target,

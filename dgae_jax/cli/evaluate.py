@@ -1,4 +1,7 @@
-"""Evaluate a trained run: python experiments/evaluate.py RUN_DIR --engine gymnasium --episodes 100"""
+"""Evaluate a trained run: dgae evaluate RUN_DIR --episodes 100
+
+Flags are checked before the rest is imported: JAX, MuJoCo and Brax take seconds to load.
+"""
 
 import os
 import sys
@@ -8,14 +11,10 @@ from typing import Literal
 
 import tyro
 
-from dgae_jax import ConfigError
 from dgae_jax.cli.arguments import fail, parse
-from dgae_jax.run import directory, files, machine, terminal
-from dgae_jax.run.checkpoint import CheckpointError
-from dgae_jax.run.evaluation import default_path, engines_of, evaluate_run
+from dgae_jax.configs.config import ConfigError, invalid
+from dgae_jax.run import directory, files, terminal
 from dgae_jax.run.options import WHOLE, RunOptions
-from dgae_jax.run.progress import Reporter
-from dgae_jax.run.summary import describe
 
 
 @dataclass(frozen=True)
@@ -24,15 +23,15 @@ class Arguments:
 
     run_dir: tyro.conf.Positional[Path]
     """Directory of the run [path]."""
-    engine: Literal["gymnasium", "native", "jax"] | None = None
-    """gymnasium (the task of the gymnasium package), native (ours in C MuJoCo) or jax (ours in JAX); by default the first
-    that the run can have."""
+    engine: Literal["gymnasium", "native", "jax", "mjx", "mjx-warp"] | None = None
+    """gymnasium (the task of the gymnasium package), or an engine as in --physics of the training; by default the first that the
+    run can have."""
     checkpoint: Literal["newest", "best"] = "newest"
     """newest, or best: of the evaluations while it trained, whose episodes chose it; take another --seed to judge it."""
     episodes: int = 20
     """Episodes per trained run [episodes]."""
     seed: int = 0
-    """Seed of the initial states [1]."""
+    """Seed of the initial states; no two seeds share any [1]."""
     out: Path | None = None
     """File to write; by default evaluation-ENGINE.json or evaluation-ENGINE-best.json in the run directory [path]."""
     cache_dir: str = RunOptions.cache_dir
@@ -41,37 +40,50 @@ class Arguments:
 
 def main() -> int:
     """Evaluate one run directory; 0 done, 2 bad input, 130 stopped by SIGINT."""
-    arguments = parse(Arguments, "Evaluate the deterministic policy of a trained run.")
-    low, high, reason = WHOLE["episodes"]
-    if not low <= arguments.episodes <= high:
-        fail(f"--episodes {arguments.episodes}: must be a whole number from {low:,} to {high:,} ({reason})")
-    if not 0 <= arguments.seed < 2**31:
-        fail(f"--seed {arguments.seed}: must be a whole number from 0 to {2**31 - 1:,}")
-    if arguments.out and not arguments.out.absolute().parent.is_dir():
-        fail(f"--out {arguments.out}: must be a file in a directory that exists")
-    if arguments.out and (arguments.out.is_symlink() or (arguments.out.exists() and not arguments.out.is_file())):
-        fail(f"--out {arguments.out}: must be a file, not a directory, a link or a device")
     terminal.prepare()
-    out = arguments.out
     try:
-        config = directory.read_config(arguments.run_dir)
-        engine = arguments.engine or engines_of(config)[0]
-        out = out or default_path(arguments.run_dir, engine, arguments.checkpoint)
-        if not os.access(out.absolute().parent, os.W_OK):
-            fail(f"--out {out}: must be a file that can be written")
-        machine.use_device(config)
-        machine.use_cache(arguments.cache_dir)
-        how = {"which": arguments.checkpoint, "engine": engine, "episodes": arguments.episodes, "seed": arguments.seed}
-        with Reporter() as reporter:
-            result = evaluate_run(arguments.run_dir, config, **how, watch=reporter.watch)
-        files.write_json(out, result)
-    except (ConfigError, CheckpointError) as mistake:
-        fail(str(mistake))
-    except OSError as reason:
-        fail(f"--out {out}: must be a file that can be written ({reason.strerror})")
+        arguments = parse(Arguments, "Evaluate the deterministic policy of a trained run.")
+        _check(arguments)
+        return _evaluate(arguments)
+    except ConfigError as mistake:
+        fail(mistake)
     except KeyboardInterrupt:
         terminal.warn("stopped by SIGINT, nothing written")
         return 130
+
+
+def _check(arguments: Arguments) -> None:
+    """Raise ConfigError for the first argument that is invalid."""
+    (low, high, reason), out = WHOLE["episodes"], arguments.out
+    if not low <= arguments.episodes <= high:
+        raise invalid("episodes", arguments.episodes, f"a whole number from {low:,} to {high:,} ({reason})")
+    if not 0 <= arguments.seed < 2**31:
+        raise invalid("seed", arguments.seed, f"a whole number from 0 to {2**31 - 1:,} (an int32)")
+    if out and not out.absolute().parent.is_dir():
+        raise invalid("out", out, "a file in a directory that exists")
+    if out and (out.is_symlink() or (out.exists() and not out.is_file())):
+        raise invalid("out", out, "a file, not a directory, a link or a device")
+
+
+def _evaluate(arguments: Arguments) -> int:
+    config = directory.read_config(arguments.run_dir)
+    from dgae_jax.run import evaluation, machine
+    from dgae_jax.run.progress import Reporter
+    from dgae_jax.run.summary import describe
+
+    engine = arguments.engine or evaluation.engines_of(config)[0]
+    out = arguments.out or evaluation.default_path(arguments.run_dir, engine, arguments.checkpoint)
+    if not os.access(out.absolute().parent, os.W_OK):
+        raise invalid("out", out, "a file that can be written")
+    machine.use_device(config)
+    machine.use_cache(arguments.cache_dir)
+    how = {"which": arguments.checkpoint, "engine": engine, "episodes": arguments.episodes, "seed": arguments.seed}
+    with Reporter() as reporter:
+        result = evaluation.evaluate_run(arguments.run_dir, config, **how, watch=reporter.watch)
+    try:
+        files.write_json(out, result)
+    except OSError as reason:
+        raise invalid("out", out, f"a file that can be written ({reason.strerror})") from reason
     terminal.say(f"{describe(result)}, {result['checkpoint']}; written to {out}")
     return 0
 

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from brax.envs.base import Env
 
 import dgae_jax.configs.pytree  # noqa: F401
-from dgae_jax.configs.config import Config, ConfigError, CriticConfig, PolicyConfig
+from dgae_jax.configs.config import Config, ConfigError, CriticConfig, PolicyConfig, lookup
 from dgae_jax.configs.parts import COVARIANCES, CRITICS, DESCENT, OPTIMIZERS, RESIDUALS, TARGETS, UPDATES
 from dgae_jax.configs.validation import validate
 from dgae_jax.envs.noise import Noisy
@@ -36,7 +36,7 @@ def make_task(config: Config) -> Env:
 def make_policy(env: Env, config: Config) -> Policy:
     """The policy network a configuration describes, sized for `env`."""
     settings = config.policy
-    covariance = COVARIANCES[settings.covariance].build
+    covariance = lookup("policy.covariance", settings.covariance, COVARIANCES).build
     return gaussian_policy(_size(env), env.action_size, hidden=settings.hidden, covariance=covariance, initial_std=settings.initial_std)
 
 
@@ -49,13 +49,15 @@ def make_algorithm(name: str, env: Env, config: Config) -> Algorithm:
         raise ConfigError(f"algo {config.algo}: must be {name}, as in make_algorithm, or left out", "algo")
     config = validate(dataclasses.replace(config, algo=name))
     policy, iterations, fit = make_policy(env, config), config.total_steps / config.samples_per_iteration, config.critic
-    kind, improve = CRITICS[fit.kind], UPDATES[config.policy.update]
-    critic = kind.build(_size(env), hidden=fit.hidden, target=TARGETS[fit.target].build, **_options(fit, kind.options))
+    kind, improve = lookup("critic.kind", fit.kind, CRITICS), lookup("policy.update", config.policy.update, UPDATES)
+    critic = kind.build(
+        _size(env), hidden=fit.hidden, target=lookup("critic.target", fit.target, TARGETS).build, **_options(fit, kind.options)
+    )
     weights = weights_of(config.metric, fit.quantiles) if fit.quantiles else None
     return Algorithm(
         policy=policy,
         critic=critic,
-        residual=RESIDUALS[config.residual].build(weights),
+        residual=lookup("residual", config.residual, RESIDUALS).build(weights),
         policy_update=improve.build(policy, iterations, **_options(config.policy, improve.options)),
         critic_update=descend(critic.loss, iterations, **_options(fit, DESCENT)),
     )

@@ -129,7 +129,7 @@ def _check_use(config: Config) -> None:
         ("policy", config.policy, config.policy.update, UPDATES),
         ("critic", config.critic, config.critic.kind, CRITICS),
     ):
-        unused = {option for each in table.values() for option in each.options} - set(table[chosen].options)
+        unused = {option for each in table.values() for option in each.options} - set(lookup(part, chosen, table).options)
         for name in sorted(unused):
             value = getattr(group, name)
             _check(f"{part}.{name}", value, value is None, f"left out: {config.algo} with {chosen} does not use it")

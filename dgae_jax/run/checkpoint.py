@@ -30,7 +30,7 @@ ARRAY = 1
 """Msgpack's extension type of an array: shape, name of the dtype and bytes, as Flax writes it."""
 
 
-class CheckpointError(ValueError):
+class CheckpointError(ConfigError):
     """A checkpoint that is missing or of another run or version; the message names the file and the reason."""
 
 

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple, TypeVar
 import jax
 
 from dgae_jax.configs.build import Fitted, make_task, make_trainer, seed_keys
-from dgae_jax.configs.config import Config
+from dgae_jax.configs.config import Config, invalid
 from dgae_jax.configs.serial import MAY_CHANGE, differences
 from dgae_jax.learn.types import TrainState
 from dgae_jax.run import checkpoint, terminal

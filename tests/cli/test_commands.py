@@ -192,7 +192,10 @@ def test_dgae_runs_a_command_by_name_and_names_them_all(monkeypatch, capsys):
             code = stop.code
         return code, *capsys.readouterr()
 
-    assert dgae("evaluate", "--episodes", "0", ".")[::2] == (2, "error: --episodes 0: must be a whole number from 1 to 10,000\n")
+    assert dgae("evaluate", "--episodes", "0", ".")[::2] == (
+        2,
+        "error: --episodes 0: must be a whole number from 1 to 10,000 (they are played side by side)\n",
+    )
     assert dgae("trian") == (2, "", "error: trian: must be one of train, evaluate\n")
     code, out, err = dgae("--help")
     assert (code, err) == (0, "")
@@ -242,7 +245,7 @@ def test_an_output_that_is_no_file_is_left_alone(trained, run, tmp_path):
     [
         (["nowhere"], r"nowhere/config.json: must be a configuration that can be read \(No such file or directory\)"),
         ([], r"RUN_DIR|PATH"),
-        ([".", "--engine", "ode"], r"'ode'.*'gymnasium', 'native', 'jax'"),
+        ([".", "--engine", "ode"], r"'ode'.*'gymnasium', 'native', 'jax', 'mjx', 'mjx-warp'"),
         ([".", "--episodes", "0"], r"--episodes 0: must be a whole number of at least 1"),
     ],
 )
