@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import pytest
 
-from dgae_jax.run import directory, metrics, restore
+from dgae_jax.run import directory, metrics, restore, training
 from dgae_jax.run import record as record_module
 from dgae_jax.run.loop import resume, train
 from dgae_jax.run.record import Record
