@@ -58,7 +58,8 @@ def test_the_budget_is_never_exceeded_and_the_first_line_says_how_much_is_used(t
 
 def test_progress_is_plain_lines_when_piped(trained):
     _, lines, errors = trained
-    assert re.search(r"^960 of 960 steps  [\d,]+ steps/s  return [\d.,]+  0:00:00 left$", lines[-2])
+    assert re.search(r"^960 of 960 steps  [\d,]+ steps/s  return [\d.,]+  0:00:00 left$", lines[-3])
+    assert lines[-2] == "evaluating 3 episodes in Hopper-v4 (gymnasium)"
     assert "\x1b" not in "".join(lines)
     assert errors == ""
 
