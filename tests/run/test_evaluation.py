@@ -15,7 +15,7 @@ from tests.helpers import SMALL
 
 def test_an_environment_of_braxs_own_is_evaluated_in_its_own_physics_only(state):
     with pytest.raises(ConfigError, match=r"--engine gymnasium: must be one of jax with brax:ant"):
-        evaluate_policies(policies_of(state), dataclasses.replace(SMALL, env="brax:ant"), engine="gymnasium", episodes=1)
+        evaluate_policies(policies_of(state), dataclasses.replace(SMALL, env="brax:ant", physics="jax"), engine="gymnasium", episodes=1)
 
 
 @pytest.mark.parametrize("engine", ["gymnasium", "native"])

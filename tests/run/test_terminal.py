@@ -80,7 +80,7 @@ OLD = {**os.environ, "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0", "LC_ALL": "C
     ("shell", "environment"),
     [
         (">/dev/full 2>/dev/full", {}),
-        (">&- 2>&- <&-", {}),
+        (">&- <&-", {}),
         (">/dev/null", {"PYTHONIOENCODING": "ascii"}),
     ],
 )
