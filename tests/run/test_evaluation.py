@@ -9,7 +9,8 @@ import dgae_jax as dg
 from dgae_jax.configs.build import make_task, make_trainer, policies_of, seed_keys
 from dgae_jax.configs.config import ConfigError
 from dgae_jax.run.evaluation import default_path, engines_of, episode_seeds, evaluate_policies
-from dgae_jax.run.summary import describe, over_seeds
+from dgae_jax.run.evaluations import EvaluationsFile
+from dgae_jax.run.summary import describe, over_seeds, summary
 from tests.helpers import SMALL
 
 
@@ -98,3 +99,13 @@ def test_of_several_seeds_the_mean_is_printed_with_its_spread_over_seeds():
         "return 20.0, mean of 3 seeds × 2 episodes of the deterministic policy in Hopper-v4 (gymnasium); standard deviation 10.0"
         " over seeds, 95 % interval of the mean 11.0 to 29.0"
     )
+
+
+def test_returns_that_are_not_finite_have_a_summary_and_count_for_nothing_in_the_file_of_evaluations(tmp_path):
+    result = summary(np.array([np.nan, np.inf, 1.0]))
+    assert np.isnan(result["return_mean"])
+    assert "nan" in describe({"seeds": [result], "episodes": 3, "env": "Hopper-v4", "engine": "gymnasium", **result})
+    file = EvaluationsFile(tmp_path / "evaluations.jsonl")
+    file.append(100, {"seeds": [{"seed": 0, **result}]})
+    assert (file.best, EvaluationsFile(file.path).best) == (None, None)
+    assert "NaN" not in file.path.read_text()
