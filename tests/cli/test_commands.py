@@ -178,9 +178,7 @@ def test_a_device_that_is_not_there_is_refused_in_one_line(tmp_path):
         env={**os.environ, "JAX_PLATFORMS": "abacus"},
     )  # fmt: skip
     assert (done.returncode, done.stdout) == (2, "")
-    assert re.fullmatch(
-        r"error: JAX_PLATFORMS=abacus: must name a device that JAX finds here, cpu for one; an NVIDIA GPU needs .*\n", done.stderr
-    )
+    assert re.fullmatch(r"error: JAX_PLATFORMS=abacus: must name a device that JAX finds here, .*; an NVIDIA GPU needs .*\n", done.stderr)
     assert not (tmp_path / "run").exists()
 
 
