@@ -55,15 +55,19 @@ def save(directory: Path, config: Config, arrays: dict[str, np.ndarray], steps: 
     """
     for name in not_finite(arrays):
         raise NotFiniteError(f"{name} is not finite after {steps:,} samples")
-    packed = {name: msgpack.ExtType(ARRAY, msgpack.packb((x.shape, x.dtype.name, x.tobytes()))) for name, x in arrays.items()}
-    body = msgpack.packb({"arrays": packed, "config": json.dumps(to_dict(config))})
+    packed = {name: _packed(x) for name, x in arrays.items()}
+    body: bytes = msgpack.packb({"arrays": packed, "config": json.dumps(to_dict(config), allow_nan=False)})  # pyright: ignore[reportAssignmentType]
     header = {"schema": SCHEMA, "sha256": hashlib.sha256(body).hexdigest()}
     path = directory / name_of(steps)
-    files.replace(path, json.dumps(header).encode() + b"\n" + body)
+    files.replace(path, json.dumps(header, allow_nan=False).encode() + b"\n" + body)
     for old in [p for p in found(directory) if p.name <= path.name][:-keep]:
         if best is None or old.name != name_of(best):
             old.unlink(missing_ok=True)
     return path
+
+
+def _packed(x: np.ndarray) -> msgpack.ExtType:
+    return msgpack.ExtType(ARRAY, msgpack.packb((x.shape, x.dtype.name, x.tobytes())))  # pyright: ignore[reportArgumentType]
 
 
 def name_of(steps: int) -> str:

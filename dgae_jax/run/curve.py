@@ -25,8 +25,8 @@ def learning_curve(steps: np.ndarray, returns: np.ndarray, title: str, evaluatio
     drawn = np.linspace(0, len(steps) - 1, min(len(steps), POINTS)).astype(int)
     steps, returns = steps[drawn], returns[drawn]
     for run in returns.T:
-        style = {"linewidth": 0.8, "alpha": 0.4} if several else {"linewidth": 1.5, "label": "training"}
-        axes.plot(steps, run, color="tab:blue", **style)
+        label = None if several else "training"
+        axes.plot(steps, run, color="tab:blue", linewidth=0.8 if several else 1.5, alpha=0.4 if several else 1, label=label)
     if several:
         mean, std = returns.mean(1), returns.std(1)
         axes.plot(steps, mean, color="tab:blue", linewidth=2, label=f"training, mean of {returns.shape[1]} seeds")

@@ -9,6 +9,7 @@ import numpy as np
 from dgae_jax.maths.statistics import bootstrap_interval, iqm
 
 
+@np.errstate(invalid="ignore")  # a return that is not finite makes numbers that are not either
 def summary(returns: np.ndarray) -> dict[str, Any]:
     """Mean, standard deviation, tails and quantiles of returns [E], and each of them."""
     worst_first = np.sort(returns)

@@ -24,7 +24,7 @@ def prepare() -> None:
         try:
             os.fstat(descriptor)
         except OSError:
-            os.open(os.devnull, os.O_RDWR)  # takes the lowest number that is free: this one
+            os.set_inheritable(os.open(os.devnull, os.O_RDWR), True)  # it takes the lowest number that is free: this one
     for name in ("stdout", "stderr"):
         stream: Any = getattr(sys, name)
         if stream is None:
@@ -85,10 +85,11 @@ def _give_up(stream: TextIO) -> None:
         os.close(nothing)
 
 
-class Steady(io.TextIOBase):
+class Steady(io.StringIO):
     """stdout for a library that prints on its own: no write to it fails."""
 
     def __init__(self, stream: TextIO):
+        super().__init__()
         self.stream = stream
 
     def write(self, text: str) -> int:
@@ -105,6 +106,6 @@ class Steady(io.TextIOBase):
         return self.stream.fileno()
 
     @property
-    def encoding(self) -> str:
+    def encoding(self) -> str:  # pyright: ignore[reportIncompatibleVariableOverride]
         """Of the stream beneath."""
         return self.stream.encoding

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
-from dgae_jax.learn.rollout import evaluate, rollout, start
+from dgae_jax.learn.rollout import rollout, start
 from tests.probes import Counter, Fragile
 
 
@@ -70,13 +70,6 @@ def test_actions_are_clipped_before_they_act_and_recorded_as_sampled(key):
     episodes, step = run(Counter(), key)
     assert_array_equal(step.action, 3.0)
     assert_array_equal(episodes.env.metrics["action"][0], 1.0)
-
-
-def test_evaluation_sums_each_episode_until_its_own_end(key):
-    totals = evaluate(Counter(length=3), lambda obs: jnp.zeros((*obs.shape[:-1], 1)), key, episodes=6, episode_length=100)
-    assert_allclose(totals, [6.0] * 6)
-    totals = evaluate(Counter(), lambda obs: jnp.zeros((*obs.shape[:-1], 1)), key, episodes=2, episode_length=4)
-    assert_allclose(totals, [10.0] * 2)
 
 
 @pytest.mark.parametrize("value", [jnp.nan, jnp.inf])

@@ -2,14 +2,16 @@
 
 import contextlib
 import dataclasses
+import re
 import resource
 import shutil
 import signal
 
+import jax
 import jax.numpy as jnp
 import pytest
 
-from dgae_jax.run import directory, metrics, restore
+from dgae_jax.run import directory, metrics, restore, training
 from dgae_jax.run import record as record_module
 from dgae_jax.run.loop import resume, train
 from dgae_jax.run.record import Record
@@ -18,7 +20,7 @@ from tests.runs import QUIET, last, small, timeless
 
 
 @pytest.mark.parametrize("evaluation", [1, 2])
-@pytest.mark.parametrize(("kind", "code"), [(signal.SIGTERM, 143), (signal.SIGINT, 130)])
+@pytest.mark.parametrize(("kind", "code"), [(signal.SIGTERM, 143), (signal.SIGINT, 130), (signal.SIGHUP, 129)])
 def test_a_signal_in_an_evaluation_breaks_it_off_and_the_run_goes_on_later_to_the_same_end(
     kind, code, evaluation, finished, tmp_path, capsys
 ):
@@ -95,3 +97,60 @@ def test_updates_that_are_not_finite_are_left_out_and_counted_and_end_the_run_wh
     state, _ = restore.training_state(tmp_path / "run", directory.read_config(tmp_path / "run"))
     assert all(jnp.isfinite(x).all() for fit in (state.policy, state.critic) for x in fit.params["params"]["Dense_0"].values())
     assert not (tmp_path / "run" / "evaluation.json").exists()
+
+
+@pytest.mark.parametrize("reason", [MemoryError(), jax.errors.JaxRuntimeError("RESOURCE_EXHAUSTED: Out of memory.\nmore")])
+def test_an_allocation_that_fails_later_is_one_line_that_names_the_checkpoint_and_nothing_is_lost(reason, finished, tmp_path, capsys):
+    run_dir, honest = tmp_path / "run", training.make_trainer
+    counts = iter(range(99))
+
+    def exhausted(*args):
+        trainer = honest(*args)
+
+        def dispatch(*args):
+            if next(counts) == 2:
+                raise reason
+            return trainer.dispatch(*args)
+
+        dispatch.lower = trainer.dispatch.lower
+        return trainer._replace(dispatch=dispatch)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(training, "make_trainer", exhausted)
+        assert train(small(), dataclasses.replace(QUIET, run_dir=run_dir)) == 1
+    why = str(reason).partition("\n")[0] or "MemoryError"
+    left = f"continue from {last(run_dir).name} with --resume {run_dir}"
+    assert capsys.readouterr().err == f"stopped: out of memory ({why}); {left}\n"
+    assert last(run_dir).name == f"steps_{timeless(run_dir)[-1]['steps']:012d}.msgpack"
+    assert resume(small(), dataclasses.replace(QUIET, resume=run_dir)) == 0
+    assert last(run_dir).read_bytes() == last(finished).read_bytes()
+    assert timeless(run_dir) == timeless(finished)
+
+
+def test_an_error_that_is_none_of_memory_stays_what_it_is(tmp_path):
+    def fails(*_, **__):
+        raise jax.errors.JaxRuntimeError("INTERNAL: a bug")
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(record_module, "evaluate_policies", fails)
+        with pytest.raises(jax.errors.JaxRuntimeError, match="a bug"):
+            train(small(), dataclasses.replace(QUIET, run_dir=tmp_path / "run"))
+
+
+def test_a_state_that_is_not_finite_ends_the_run_in_one_line_and_is_not_saved(tmp_path, capsys):
+    run_dir, honest = tmp_path / "run", Record.save
+
+    def save(record, state):
+        if record.steps == 512:
+            state = state._replace(observations=jax.tree.map(lambda x: x * jnp.nan, state.observations))
+        honest(record, state)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Record, "save", save)
+        assert train(small(), dataclasses.replace(QUIET, run_dir=run_dir)) == 1
+    assert re.fullmatch(
+        rf"stopped: observations\.\S+ is not finite after 512 samples, which is not saved; continue from steps_000000000256.msgpack"
+        rf" with --resume {run_dir}\n",
+        capsys.readouterr().err,
+    )
+    assert last(run_dir).name == "steps_000000000256.msgpack"

@@ -47,7 +47,7 @@ def test_twenty_five_kills_at_random_moments_lose_nothing(tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("kind", "code"), [(signal.SIGTERM, 143), (signal.SIGINT, 130)])
+@pytest.mark.parametrize(("kind", "code"), [(signal.SIGTERM, 143), (signal.SIGINT, 130), (signal.SIGHUP, 129)])
 def test_a_signal_saves_within_half_a_minute_and_a_second_one_ends_at_once(kind, code, tmp_path):
     run_dir = tmp_path / "run"
     argv = ["--run-dir", str(run_dir), "--total-steps", "100_000_000", "--physics", "native", "--episodes", "1"]
@@ -69,8 +69,50 @@ def test_a_signal_saves_within_half_a_minute_and_a_second_one_ends_at_once(kind,
             process.send_signal(kind)
         out, _ = process.communicate(timeout=60)
         assert time.monotonic() - since < 30
-        assert process.returncode in ((code,) if signals == 1 else (code, -kind))
+        # a second SIGHUP does not end it: a terminal that closes may send several
+        assert process.returncode in ((code,) if signals == 1 or kind == signal.SIGHUP else (code, -kind))
         if signals == 1:
             assert f"continue with --resume {run_dir}" in out
     state, _ = restore.training_state(run_dir, directory.read_config(run_dir))
     assert int(state.iteration[0]) >= 1
+
+
+@pytest.mark.parametrize(("kind", "code"), [(signal.SIGTERM, 143), (signal.SIGINT, 130), (signal.SIGHUP, 129)])
+def test_a_signal_while_it_compiles_ends_it_at_once(kind, code, tmp_path):
+    layers = ["8"] * 300  # minutes of compilation
+    argv = ["--run-dir", str(tmp_path / "run"), "--total-steps", "640", *TINY, "--policy.hidden", *layers]
+    command = [sys.executable, "-u", "experiments/train.py", *argv]
+    process = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    for line in process.stdout:
+        if line.startswith("compiling, "):
+            break
+    process.send_signal(kind)
+    out, err = process.communicate()
+    assert (process.returncode, out, err) == (code, f"stopped by {kind.name}; continue with --resume {tmp_path / 'run'}\n", "")
+    assert (tmp_path / "run" / "metrics.jsonl").read_bytes() == b""
+
+
+def test_a_run_under_nohup_stays_when_its_terminal_goes(tmp_path):
+    argv = ["--run-dir", str(tmp_path / "run"), "--total-steps", "640", "--episodes", "1", *TINY]
+    command = ["nohup", sys.executable, "experiments/train.py", *argv]
+    process = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True)
+    assert process.stdout.readline()
+    process.send_signal(signal.SIGHUP)
+    out, _ = process.communicate()
+    assert process.returncode == 0, out
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["config.json", "checkpoints", "metrics.jsonl", "evaluations.jsonl"])
+def test_a_kill_at_the_moment_a_file_appears_leaves_what_can_be_started_or_resumed(name, tmp_path):
+    run_dir = tmp_path / "run"
+    argv = ["--resume-or-start", "--run-dir", str(run_dir), "--total-steps", "640", "--episodes", "1", *TINY]
+    command = [sys.executable, "experiments/train.py", *argv]
+    process = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.DEVNULL)
+    while not (run_dir / name).exists():
+        assert process.poll() is None
+    process.kill()
+    process.wait()
+    assert subprocess.run(command, cwd=ROOT, stdout=subprocess.DEVNULL).returncode == 0
+    assert (run_dir / "evaluation.json").exists()
+    assert [p.name for p in tmp_path.iterdir()] == ["run"]

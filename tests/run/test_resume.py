@@ -3,12 +3,13 @@
 import dataclasses
 import json
 import shutil
+from pathlib import Path
 
 import pytest
 
 from dgae_jax.configs.config import ConfigError
 from dgae_jax.run import directory, files, manifest, metrics
-from dgae_jax.run.loop import resume, train
+from dgae_jax.run.loop import resume, resume_or_start, train
 from dgae_jax.run.options import RunOptions
 from tests.helpers import SMALL
 from tests.runs import QUIET, last, small, timeless
@@ -123,3 +124,28 @@ def test_a_resumed_run_goes_on_with_its_options(run_dir):
     assert manifest.options(run_dir) == RunOptions(checkpoint_every=256, episodes=1)
     manifest.add(run_dir, RunOptions(keep_checkpoints=7, debug_nonfinite=True))
     assert manifest.options(run_dir) == RunOptions(keep_checkpoints=7, debug_nonfinite=True)
+
+
+def test_resume_or_start_starts_a_run_and_then_goes_on_with_it(finished, tmp_path):
+    run_dir = tmp_path / "run"
+    options = dataclasses.replace(QUIET, run_dir=run_dir, resume_or_start=True)
+    assert resume_or_start(small(), options) == 0
+    assert timeless(run_dir) == timeless(finished)
+    last(run_dir).unlink()
+    assert resume_or_start(small(), options) == 0
+    assert last(run_dir).read_bytes() == last(finished).read_bytes()
+    assert timeless(run_dir) == timeless(finished)
+    with pytest.raises(ConfigError, match=r"--gamma 0\.5: must be 0\.99 as in"):
+        resume_or_start(dataclasses.replace(small(), gamma=0.5), options)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"resume_or_start": True}, "--resume-or-start True: must come with the directory to look in, --run-dir DIR"),
+        ({"resume_or_start": True, "resume": Path("x")}, "--resume-or-start True: must be left out: --resume only resumes"),
+    ],
+)
+def test_resume_or_start_needs_a_directory_and_no_other_way_to_resume(options, message):
+    with pytest.raises(ConfigError, match=message):
+        resume_or_start(small(), dataclasses.replace(QUIET, **options))

@@ -63,7 +63,7 @@ def test_a_quiet_run_says_nothing_and_still_warns(capsys):
 
 def train(run_dir, shell="", **how):
     """The command on a tiny run, its streams as the shell says."""
-    argv = ["experiments/train.py", "--run-dir", run_dir, "--total-steps", "1280", "--algo", "ppo", "--episodes", "1", *TINY]
+    argv = ["experiments/train.py", "--run-dir", run_dir, "--total-steps", "256", "--algo", "ppo", "--episodes", "1", *TINY]
     script = f'exec "$0" "$@" {shell}'
     return subprocess.Popen(["bash", "-c", script, sys.executable, *map(str, argv)], cwd=ROOT, **how)  # fmt: skip
 
@@ -79,13 +79,9 @@ OLD = {**os.environ, "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0", "LC_ALL": "C
 @pytest.mark.parametrize(
     ("shell", "environment"),
     [
-        (">/dev/full", {}),
-        (">&-", {}),
-        ("2>&-", {}),
-        (">&- 2>&- <&-", {}),
         (">/dev/full 2>/dev/full", {}),
+        (">&- 2>&- <&-", {}),
         (">/dev/null", {"PYTHONIOENCODING": "ascii"}),
-        (">/dev/null", {"PYTHONIOENCODING": "latin-1"}),
     ],
 )
 def test_a_run_ends_well_whatever_becomes_of_its_output(shell, environment, tmp_path):
@@ -117,7 +113,7 @@ def test_a_live_bar_ends_no_run_on_an_old_terminal_or_one_that_is_gone(hung_up, 
         reader.join()
         os.close(master)
         assert b"Traceback" not in b"".join(shown)
-        assert b"1,280 of 1,280 steps" in b"".join(shown)
+        assert b"256 of 256 steps" in b"".join(shown)
 
 
 def _read_all(master, shown):

@@ -1,0 +1,125 @@
+"""Runs from Python."""
+
+import dataclasses
+import signal
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+
+from dgae_jax.configs.build import make_greedy, make_task
+from dgae_jax.configs.config import ConfigError
+from dgae_jax.run import api, directory, restore
+from dgae_jax.run import record as record_module
+from dgae_jax.run.api import load_policy, train
+from dgae_jax.run.evaluation import evaluate_policies
+from dgae_jax.run.training import RunError
+from tests.runs import ITERATIONS, QUIET, last, small, timeless
+
+CHOSEN = {"cache_dir": QUIET.cache_dir, "episodes": 1, "checkpoint_every": QUIET.checkpoint_every}
+
+
+def observations(*shape):
+    return np.random.default_rng(0).normal(size=(*shape, 11)).astype(np.float32)
+
+
+def test_a_run_without_a_directory_leaves_nothing_but_what_it_returns(finished, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(api.tempfile, "tempdir", str(tmp_path))
+    run = train(small(), quiet=True, **CHOSEN)
+    assert capsys.readouterr() == ("", "")
+    assert list(tmp_path.iterdir()) == []
+    assert run.directory is None
+    assert [row["iteration"] for row in run.metrics] == list(range(1, ITERATIONS + 1))
+    assert [row["episode_return"] for row in run.metrics] == [row["episode_return"] for row in timeless(finished)]
+    assert run.evaluation["episodes"] == 1
+    np.testing.assert_array_equal(run.policy(observations(5)), load_policy(finished)(observations(5)))
+
+
+def test_a_run_with_a_directory_is_that_of_the_command_line_and_goes_on_if_asked_to(finished, tmp_path):
+    run_dir = tmp_path / "run"
+    config = dataclasses.replace(small(), total_steps=small().total_steps // 2)
+    assert train(config, run_dir, quiet=True, **CHOSEN).directory == run_dir
+    with pytest.raises(ConfigError, match="must be a new or empty directory"):
+        train(small(), run_dir, quiet=True, **CHOSEN)
+    longer = dataclasses.replace(small(), total_steps=small().total_steps + 64)
+    run = train(longer, str(run_dir), quiet=True, resume_or_start=True, **CHOSEN)
+    assert (run.directory, len(run.metrics)) == (run_dir, ITERATIONS + 1)
+    assert directory.read_config(run_dir).total_steps == longer.total_steps
+
+
+@pytest.mark.parametrize(
+    ("config", "options", "message"),
+    [
+        (dataclasses.replace(small(), gamma=1.5), {}, "gamma 1.5: must be"),
+        (small(), {"episodes": 0}, "episodes 0: must be"),
+        (small(), {"episode": 3}, "episode: must be one of cache_dir, "),
+        (small(), {"resume": "x"}, "resume: must be one of cache_dir, "),
+    ],
+)
+def test_an_invalid_setting_is_refused_before_anything_is_written(config, options, message, tmp_path, monkeypatch):
+    monkeypatch.setattr(api.tempfile, "tempdir", str(tmp_path))
+    with pytest.raises(ConfigError, match=message):
+        train(config, **options)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_signal_is_an_exception_that_names_the_directory_to_go_on_in(tmp_path, monkeypatch):
+    monkeypatch.setattr(api.tempfile, "tempdir", str(tmp_path))
+    monkeypatch.setattr(record_module, "evaluate_policies", lambda *_, **__: signal.raise_signal(signal.SIGTERM))
+    with pytest.raises(RunError, match="stopped by SIGTERM; continue with --resume ") as caught:
+        train(small(), quiet=True, **CHOSEN)
+    assert caught.value.exit_code == 143
+    assert last(Path(str(caught.value).rpartition(" ")[2])).name == "steps_000000000256.msgpack"
+
+
+@pytest.mark.parametrize("shape", [(), (7,), (3, 2)])
+def test_a_policy_takes_observations_with_any_leading_axes(shape, finished):
+    policy = load_policy(finished)
+    obs = observations(*shape)
+    actions, quantiles = policy(obs), policy.quantiles(obs)
+    assert (type(actions), actions.shape, quantiles.shape) == (np.ndarray, (*shape, 3), (*shape, 1))
+    one_by_one = np.array([policy(each) for each in obs.reshape(-1, 11)]).reshape(actions.shape)
+    np.testing.assert_allclose(actions, one_by_one, atol=1e-6)
+    assert (np.abs(actions) <= 1).all()
+
+
+@pytest.mark.parametrize("shape", [(12,), (11, 1), ()])
+def test_observations_of_another_size_are_refused(shape, finished):
+    with pytest.raises(ValueError, match="the last axis must be 11"):
+        load_policy(finished)(np.zeros(shape))
+
+
+def test_a_policy_does_what_evaluations_play(finished, monkeypatch):
+    config, seen = directory.read_config(finished), []
+    policies = restore.trained(finished, config, "newest").policy
+    greedy = jax.jit(make_greedy(make_task(config), config))
+
+    def watched(policy, obs):
+        seen.append((obs, np.asarray(greedy(policy, obs))))
+        return seen[-1][1]
+
+    watched.lower = greedy.lower
+    monkeypatch.setattr("dgae_jax.run.evaluation._greedy", lambda _: watched)
+    evaluate_policies(policies, config, episodes=4)
+    policy = load_policy(finished)
+    assert len(seen) > 5
+    for obs, action in seen:
+        np.testing.assert_array_equal(policy(obs), action)
+
+
+def test_of_seeds_trained_side_by_side_each_has_its_policy(tmp_path):
+    train(small("ppo", seeds=3), tmp_path / "run", quiet=True, **CHOSEN)
+    policies = [load_policy(tmp_path / "run", seed=i) for i in range(3)]
+    actions = [policy(observations(4)) for policy in policies]
+    assert not np.array_equal(actions[0], actions[1])
+    for seed in (3, -1, True, 1.0):
+        with pytest.raises(ConfigError, match=r"seed .*: must be a whole number from 0 to 2"):
+            load_policy(tmp_path / "run", seed=seed)
+
+
+def test_a_choice_that_does_not_exist_is_refused(finished, tmp_path):
+    with pytest.raises(ConfigError, match="last: must be one of newest, best"):
+        load_policy(finished, "last")
+    with pytest.raises(ConfigError, match=r"config\.json: must be a configuration that can be read"):
+        load_policy(tmp_path)
