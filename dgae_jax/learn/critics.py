@@ -62,7 +62,7 @@ def _critic(obs_size: int, outputs: int, hidden: Sequence[int], target: Target, 
         return target.compute(None, batch.reward, batch.discount, None, None, following)
 
     def loss(params: Params, batch: Batch):
-        return jnp.where(batch.sound, distance(network.apply(params, batch.obs), fitted_to(params, batch)), 0).mean(), {}
+        return jnp.where(batch.valid, distance(network.apply(params, batch.obs), fitted_to(params, batch)), 0).mean(), {}
 
     return Critic(network.init, network.apply, target.compute, loss)
 

@@ -14,7 +14,7 @@ def test_a_perfect_critic_of_a_normal_reward_is_calibrated(key):
     zero = jnp.zeros(shape)
     got = diagnostics.of_critic(reward, zero, zero, quantiles, jnp.zeros_like(quantiles))
     assert_allclose(got["critic/coverage_90"], 0.9, atol=0.015)
-    assert_allclose([got["critic/pit_mean"], got["critic/pit_deviation"]], [0.5, 1 / 12**0.5], atol=0.015)
+    assert_allclose([got["critic/pit_mean"], got["critic/pit_std"]], [0.5, 1 / 12**0.5], atol=0.015)
     assert_allclose(got["critic/wasserstein"], 2 / jnp.pi**0.5, atol=0.03)  # E|X − Y| of two standard normals
     assert got["critic/crossing"] == 0
 
