@@ -21,12 +21,15 @@ from dgae_jax.maths.transport import quantile_huber_loss
 
 
 class Target(NamedTuple):
-    """What a critic is fitted to."""
+    """The target of a critic's fit."""
 
     compute: Callable
     """`compute(key, reward, discount, trace, quantiles, next_quantiles) -> [T, N, J]`, one signature for all."""
     recompute: bool = False
-    """Whether it is computed anew at every gradient step, with the critic as it is then, or once per iteration."""
+    """Whether it is computed at every gradient step with the current critic, or once per iteration with the critic that acted.
+
+    Only for one-step targets: a shuffled minibatch has neither key nor trace, which are None then, as are the quantiles.
+    """
 
 
 def _bellman(key, reward, discount, trace, quantiles, next_quantiles):
