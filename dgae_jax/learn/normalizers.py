@@ -15,6 +15,9 @@ from jaxtyping import Array, ArrayLike, Bool, Float
 OBSERVATION_LIMIT = 10.0
 """Normalised observations are clipped to ±10 standard deviations."""
 
+MOST_EXTREMES = 20
+"""Most values at either end of the first rollout that are not taken for usual, which keeps finding them cheap."""
+
 Statistics = running_statistics.RunningStatisticsState
 
 
@@ -76,17 +79,19 @@ def _update(statistics: Statistics, rollout: Float[Array, "T N *F"], valid: Bool
 def _bounded(statistics: Statistics, rollout: Float[Array, "T N *F"]) -> Float[Array, "T N *F"]:
     """Each sample at most as far from the mean as the root of the sum of squares of all before this rollout.
 
-    Where that sum is 0 (nothing was seen, or a constant) the middle 98 % of the rollout itself stand for what was seen, and where
-    they are a constant too there is no bound.
+    Where that sum is 0 (nothing was seen, or equal values only) the rollout itself, without its lowest and its highest hundredth,
+    stands for what was seen; where that has equal values only too, there is no bound.
     """
     mean, squares = (jnp.asarray(x) for x in (statistics.mean, statistics.summed_variance))
 
     def of_the_rollout():
-        ordered = jnp.sort(rollout.reshape(-1, *mean.shape), axis=0)
-        count = len(ordered)
-        cut = min(-(-count // 100), (count - 1) // 2)
-        middle = ordered[cut : count - cut]
-        return middle.mean(0), ((middle - middle.mean(0)) ** 2).sum(0)
+        samples = jnp.moveaxis(rollout.reshape(-1, *mean.shape), 0, -1)
+        count = samples.shape[-1]
+        extremes = min(-(-count // 100), (count - 1) // 2, MOST_EXTREMES)
+        highest, lowest = (jax.lax.top_k(x, extremes + 1)[0].min(-1) for x in (samples, -samples))  # the last by index would sort all
+        usual = (-lowest <= rollout) & (rollout <= highest)
+        centre = rollout.mean((0, 1), where=usual)
+        return centre, ((rollout - centre) ** 2).sum((0, 1), where=usual)
 
     first_mean, first_squares = jax.lax.cond((squares > 0).all(), lambda: (mean, squares), of_the_rollout)
     mean, squares = (jnp.where(squares > 0, *pair) for pair in ((mean, first_mean), (squares, first_squares)))
