@@ -2,7 +2,7 @@
 
 import dataclasses
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -16,8 +16,8 @@ from dgae_jax.envs.noise import Noisy
 from dgae_jax.envs.registry import make_env
 from dgae_jax.learn import diagnostics, iteration, parallel
 from dgae_jax.learn.networks import gaussian_policy
-from dgae_jax.learn.normalizers import Statistics, normalize
-from dgae_jax.learn.types import Algorithm, Params, Policy, TrainState
+from dgae_jax.learn.normalizers import normalize
+from dgae_jax.learn.types import Algorithm, Fitted, Policy, TrainState
 from dgae_jax.learn.updates import descend
 from dgae_jax.maths.risk import weights_of
 
@@ -107,13 +107,6 @@ def make_trainer(env: Env, capacity: int) -> parallel.Trainer:
 def seed_keys(config: Config) -> jax.Array:
     """One key per run: `key(seed)`, `key(seed + 1)`, …"""
     return jnp.stack([jax.random.key(config.seed + i) for i in range(config.num_seeds)])
-
-
-class Fitted(NamedTuple):
-    """A network of a trained run and the statistics that its observations are normalised by: all that using it takes."""
-
-    params: Params
-    observations: Statistics
 
 
 def policies_of(state: TrainState) -> Fitted:

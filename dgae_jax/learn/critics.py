@@ -21,12 +21,15 @@ from dgae_jax.maths.transport import quantile_huber_loss
 
 
 class Target(NamedTuple):
-    """What a critic is fitted to."""
+    """The target of a critic's fit."""
 
     compute: Callable
     """`compute(key, reward, discount, trace, quantiles, next_quantiles) -> [T, N, J]`, one signature for all."""
     recompute: bool = False
-    """Whether it is computed anew at every gradient step, with the critic as it is then, or once per iteration."""
+    """Whether it is computed at every gradient step with the current critic, or once per iteration with the critic that acted.
+
+    Only for one-step targets: a shuffled minibatch has neither key nor trace, which are None then, as are the quantiles.
+    """
 
 
 def _bellman(key, reward, discount, trace, quantiles, next_quantiles):
@@ -62,7 +65,7 @@ def _critic(obs_size: int, outputs: int, hidden: Sequence[int], target: Target, 
         return target.compute(None, batch.reward, batch.discount, None, None, following)
 
     def loss(params: Params, batch: Batch):
-        return jnp.where(batch.sound, distance(network.apply(params, batch.obs), fitted_to(params, batch)), 0).mean(), {}
+        return jnp.where(batch.valid, distance(network.apply(params, batch.obs), fitted_to(params, batch)), 0).mean(), {}
 
     return Critic(network.init, network.apply, target.compute, loss)
 

@@ -1,4 +1,4 @@
-"""Whether a critic can be trusted: its quantiles against the returns that came."""
+"""Calibration of a critic: its quantiles against the returns that were observed."""
 
 from collections.abc import Callable
 
@@ -13,7 +13,7 @@ SIMILAR = 0.1
 """Means count as similar where |d| is at most this share of W₁."""
 
 Diagnose = Callable[..., dict[str, Array]]
-"""`diagnose(reward, discount, going, quantiles, next_quantiles) -> metrics`, of one rollout."""
+"""`diagnose(reward, discount, continues, quantiles, next_quantiles) -> metrics`, of one rollout."""
 
 
 def nothing(*_: Array) -> dict[str, Array]:
@@ -24,16 +24,16 @@ def nothing(*_: Array) -> dict[str, Array]:
 def of_critic(
     reward: Float[Array, "T N"],
     discount: Float[Array, "T N"],
-    going: Float[Array, "T N"],
+    continues: Float[Array, "T N"],
     quantiles: Float[Array, "T N K"],
     next_quantiles: Float[Array, "T N K"],
 ) -> dict[str, Array]:
     """Calibration against Monte-Carlo returns: discounted sums to the episode's end, or to the rollout's and the value there.
 
-    `going` is 1 where the episode goes on. `similar_means` is the share of steps whose target and prediction have similar
+    `continues` is 1 where the episode continues. `similar_means` is the share of steps whose target and prediction have similar
     means and different shapes, |d(r + γG′, G)| ≤ 0.1 W₁(r + γG′, G) (Sec. results).
     """
-    outcome = lambda_return(reward, discount, going, quantiles, next_quantiles)
+    outcome = lambda_return(reward, discount, continues, quantiles, next_quantiles)
     probability, target = pit(quantiles, outcome), bellman_target(reward, discount, next_quantiles)
     similar = jnp.abs(directional_metric(target, quantiles)) <= SIMILAR * wasserstein(target, quantiles)
     return {
@@ -41,6 +41,6 @@ def of_critic(
         "critic/crossing": (quantiles[..., 1:] < quantiles[..., :-1]).mean() if quantiles.shape[-1] > 1 else jnp.zeros(()),
         "critic/coverage_90": coverage(quantiles, outcome, 0.9),
         "critic/pit_mean": probability.mean(),
-        "critic/pit_deviation": probability.std(),
+        "critic/pit_std": probability.std(),
         "critic/similar_means": similar.mean(),
     }

@@ -1,17 +1,16 @@
 """One training iteration as one pure function: roll out, estimate advantages, improve the policy, fit the critic."""
 
 from collections.abc import Callable
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 from brax.envs.base import Env
-from jaxtyping import Array, ArrayLike, Key
+from jaxtyping import Array, ArrayLike, Bool, Key
 
 from dgae_jax.learn import normalizers
 from dgae_jax.learn.diagnostics import Diagnose, nothing
 from dgae_jax.learn.rollout import Act, Episodes, rollout, start
-from dgae_jax.learn.types import Algorithm, Batch, Fit, TrainState, Transition
+from dgae_jax.learn.types import Algorithm, Batch, Fit, Fitted, TrainState, Transition, Update
 from dgae_jax.maths import gaussian
 from dgae_jax.maths.returns import decay, lambda_return, lambda_sum
 from dgae_jax.maths.statistics import explained_variance
@@ -36,6 +35,7 @@ def make_train(
 
     Both are pure; jit, scan and vmap them. One step consumes `num_envs * horizon` samples. γ and λ may be traced.
     """
+    obs_size = int(env.observation_size)  # pyright: ignore[reportArgumentType]
 
     def init(key: Key[Array, ""]) -> TrainState:
         policy_key, critic_key, env_key, key = jax.random.split(key, 4)
@@ -43,8 +43,8 @@ def make_train(
         return TrainState(
             policy=Fit(policy, algorithm.policy_update.init(policy)),
             critic=Fit(critic, algorithm.critic_update.init(critic)),
-            observations=normalizers.observations(int(env.observation_size)),  # pyright: ignore[reportArgumentType]
-            returns=normalizers.return_scale(num_envs),
+            observations=normalizers.observations(obs_size) if normalize_observations else None,
+            reward_scale=normalizers.reward_scale(num_envs),
             episodes=start(env, env_key, num_envs),
             key=key,
             iteration=jnp.int32(0),
@@ -54,41 +54,44 @@ def make_train(
     @jax.default_matmul_precision("highest")  # TF32 ruins training on GPUs that default to it
     def train_step(state: TrainState) -> tuple[TrainState, Metrics]:
         act_key, target_key, policy_key, critic_key, key = jax.random.split(state.key, 5)
-        episodes, step = rollout(env, _acting(algorithm, state), state.episodes, act_key, horizon=horizon, episode_length=episode_length)
-        returns, reward = state.returns, step.reward
+        act = _acting(algorithm, Fitted(state.policy.params, state.observations))
+        episodes, step = rollout(env, act, state.episodes, act_key, horizon=horizon, episode_length=episode_length)
+        reward_scale, reward, observations = state.reward_scale, step.reward, state.observations
         if normalize_rewards:
             done = (step.terminated | step.truncated).astype(reward.dtype)
-            returns, reward = normalizers.rescale(returns, reward, done, gamma)
+            reward_scale, reward = normalizers.rescale(reward_scale, reward, done, step.valid, gamma)
         batch, estimates = _estimate(algorithm, state, step, reward, target_key, gamma, lam, diagnose)
-        policy, improved = algorithm.policy_update.step(policy_key, state.policy, batch)
-        critic, evaluated = algorithm.critic_update.step(critic_key, state.critic, batch)
-        sound = _finite((policy, critic, improved["loss"], evaluated["loss"]))
-        policy, critic = jax.tree.map(lambda new, old: jnp.where(sound, new, old), (policy, critic), (state.policy, state.critic))
-        observations = normalizers.observe(state.observations, step.obs, step.sound) if normalize_observations else state.observations
+        policy, policy_info, policy_finite = _improve(algorithm.policy_update, policy_key, state.policy, batch)
+        critic, critic_info, critic_finite = _improve(algorithm.critic_update, critic_key, state.critic, batch)
+        if normalize_observations:
+            observations = normalizers.observe(observations, step.obs, step.valid)
+        updated = policy_finite & critic_finite
+        failures = jnp.where(updated & (step.valid.mean() >= 0.5), 0, state.failures + 1)
         metrics = {
             **_account(episodes, step),
             "nonfinite": episodes.nonfinite - state.episodes.nonfinite,
-            "skipped": 1.0 - sound,
-            **{f"policy/{name}": value for name, value in improved.items()},
-            **{f"critic/{name}": value for name, value in evaluated.items()},
+            "skipped": 1.0 - updated,
+            **{f"policy/{name}": value for name, value in policy_info.items()},
+            **{f"critic/{name}": value for name, value in critic_info.items()},
             **estimates,
         }
-        failures = jnp.where(sound, 0, state.failures + 1)
-        return TrainState(policy, critic, observations, returns, episodes, key, state.iteration + 1, failures), metrics
+        return TrainState(policy, critic, observations, reward_scale, episodes, key, state.iteration + 1, failures), metrics
 
     return init, train_step
 
 
-def _finite(tree: Any) -> Array:
-    """Whether every number is finite."""
-    return jnp.stack([jnp.isfinite(x).all() for x in jax.tree.leaves(tree)]).all()
+def _improve(update: Update, key: Key[Array, ""], fit: Fit, batch: Batch) -> tuple[Fit, Metrics, Bool[Array, ""]]:
+    """One network's update, left out if it is not finite: policy and critic each stand for themselves."""
+    new, info = update.step(key, fit, batch)
+    finite = jnp.stack([jnp.isfinite(x).all() for x in jax.tree.leaves((new, info["loss"]))]).all()
+    return jax.tree.map(lambda after, before: jnp.where(finite, after, before), new, fit), info, finite
 
 
-def _acting(algorithm: Algorithm, state: TrainState) -> Act:
-    """The policy under the statistics of this iteration."""
+def _acting(algorithm: Algorithm, actor: Fitted) -> Act:
+    """Actions drawn from the policy, and their log-probabilities."""
 
     def act(key: Array, obs: Array) -> tuple[Array, Array]:
-        distribution = algorithm.policy.apply(state.policy.params, normalizers.normalize(state.observations, obs))
+        distribution = algorithm.policy.apply(actor.params, normalizers.normalize(actor.observations, obs))
         action = gaussian.sample(key, distribution)
         return action, gaussian.log_prob(distribution, action)
 
@@ -105,28 +108,28 @@ def _estimate(
     lam: ArrayLike,
     diagnose: Diagnose,
 ) -> tuple[Batch, Metrics]:
-    """What the updates learn from: standardised advantages, and the critic's target, from the critic that acted."""
+    """The samples the updates learn from: standardised advantages and the critic's target, both from the critic that acted."""
     obs, next_obs = (normalizers.normalize(state.observations, x) for x in (step.obs, step.next_obs))
     quantiles, next_quantiles = (algorithm.critic.predict(state.critic.params, x) for x in (obs, next_obs))
     discount, trace = decay(step.terminated, step.truncated, gamma=gamma, lam=lam)
     residual = algorithm.residual(reward, discount, quantiles, next_quantiles)
     advantage = lambda_sum(residual, discount * trace)
     target = algorithm.critic.target(key, reward, discount, trace, quantiles, next_quantiles)
-    standard = (advantage - advantage.mean()) / (advantage.std() + 1e-8)
-    standard = jnp.where(step.sound, standard, 0)
-    batch = Batch(obs, step.action, step.log_prob, standard, target, reward, discount, next_obs, step.sound)
+    mean, std = advantage.mean(where=step.valid), advantage.std(where=step.valid)
+    standard = jnp.where(step.valid, (advantage - mean) / (std + 1e-8), 0)
+    batch = Batch(obs, step.action, step.log_prob, standard, target, reward, discount, next_obs, step.valid)
     value = quantiles.mean(-1)
-    going = 1.0 - (step.terminated | step.truncated)
+    continues = 1.0 - (step.terminated | step.truncated)
     metrics = {
         "critic/value": value.mean(),
         "critic/explained_variance": explained_variance(value, lambda_return(reward, discount, trace, quantiles, next_quantiles)),
-        **diagnose(reward, discount, going, quantiles, next_quantiles),
+        **diagnose(reward, discount, continues, quantiles, next_quantiles),
     }
     return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), batch), metrics
 
 
 def _account(episodes: Episodes, step: Transition) -> Metrics:
-    """How the episodes went, in raw rewards."""
+    """Returns and lengths of the last episodes, in rewards that are not scaled."""
     return {
         "episode_return": jnp.nanmean(episodes.last_total),
         "episode_length": jnp.nanmean(episodes.last_steps),

@@ -64,7 +64,7 @@ class SharedCovariance(nn.Module):
 
 
 class StateCovariance(nn.Module):
-    """Mean and log σ both from the observation; σ is held between e⁻⁵ and e², where rounding is no danger."""
+    """Mean and log σ both from the observation; σ is clipped to e⁻⁵ … e², far from overflow in σ⁻²."""
 
     hidden: Sequence[int]
     actions: int

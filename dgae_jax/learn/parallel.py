@@ -19,7 +19,7 @@ class Trainer(NamedTuple):
     """`init(config, keys [S]) -> state`."""
     dispatch: Callable[[Any, TrainState, int], tuple[TrainState, Metrics]]
     """`dispatch(config, state, count) -> (state, metrics [capacity, S])`: `count <= capacity` iterations; rows from
-    `count` on are zero. The state handed in is consumed."""
+    `count` on are zero. The buffers of the input state are donated."""
 
 
 def make_trainer(make_train: Callable[[Any], tuple[Callable, Callable]], capacity: int) -> Trainer:

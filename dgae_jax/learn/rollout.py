@@ -54,19 +54,19 @@ def _finite(tree: Any) -> Bool[Array, " N"]:
     return jnp.stack([jnp.isfinite(x).reshape(x.shape[0], -1).all(1) for x in leaves]).all(0)
 
 
-def _quarantine(step: Transition, sound: Bool[Array, " N"]) -> Transition:
-    """The step with no number in it that is not finite; an unsound one goes nowhere for reward 0."""
+def _quarantine(step: Transition, valid: Bool[Array, " N"]) -> Transition:
+    """The step with every number finite: an invalid one has action, log-probability and reward 0 and stays where it was."""
     obs = jnp.where(jnp.isfinite(step.obs), step.obs, 0)
-    action, log_prob, reward = (jnp.where(_like(sound, x), x, 0) for x in (step.action, step.log_prob, step.reward))
-    next_obs = jnp.where(sound[:, None], step.next_obs, obs)
+    action, log_prob, reward = (jnp.where(_like(valid, x), x, 0) for x in (step.action, step.log_prob, step.reward))
+    next_obs = jnp.where(valid[:, None], step.next_obs, obs)
     return step._replace(obs=obs, action=action, log_prob=log_prob, reward=reward, next_obs=next_obs)
 
 
-def _record(episodes: Episodes, attempt: Any, sound: Bool[Array, " N"]) -> Episodes:
-    """Count the unsound worlds and keep what the first of them attempted."""
-    world = jnp.argmin(sound)
-    incident = jax.tree.map(lambda new, old: jnp.where(sound.all(), old, new[world]), attempt, episodes.incident)
-    return episodes._replace(nonfinite=episodes.nonfinite + (~sound).sum(), incident=incident)
+def _record(episodes: Episodes, attempt: Any, valid: Bool[Array, " N"]) -> Episodes:
+    """Count the invalid worlds and keep the state before and the action of the first of them."""
+    world = jnp.argmin(valid)
+    incident = jax.tree.map(lambda new, old: jnp.where(valid.all(), old, new[world]), attempt, episodes.incident)
+    return episodes._replace(nonfinite=episodes.nonfinite + (~valid).sum(), incident=incident)
 
 
 def _advance(episodes: Episodes, after: Any, step: Transition, fresh: Episodes) -> Episodes:
@@ -89,8 +89,8 @@ def rollout(
     """`horizon` steps in every world. The action is clipped to the actuators' range before it acts, not in the record.
 
     An episode that ends is followed by a fresh random one; `next_obs` stays the observation in which it ended. A world
-    whose action, state, reward or observation turns non-finite is in quarantine: its episode ends there as terminated
-    with reward 0, and no number of that step that is not finite leaves this function.
+    whose action, state, reward or observation turns non-finite is quarantined: its episode ends there as terminated
+    with reward 0, the step is marked as not `valid`, and only finite numbers leave this function.
     """
     low, high = env.action_range
 
@@ -99,12 +99,12 @@ def rollout(
         before = episodes.env
         action, log_prob = act(act_key, before.obs)
         after = jax.vmap(env.step)(before, jnp.clip(action, low, high))
-        sound = _finite((before.obs, action, log_prob, after.pipeline_state, after.reward, after.obs, after.done))
-        terminated = (after.done > 0) | ~sound
+        valid = _finite((before.obs, action, log_prob, after.pipeline_state, after.reward, after.obs, after.done))
+        terminated = (after.done > 0) | ~valid
         truncated = ~terminated & (episodes.steps + 1 >= episode_length)
-        step = Transition(before.obs, action, log_prob, after.reward, terminated, truncated, after.obs, sound)  # pyright: ignore[reportArgumentType]
-        step = _quarantine(step, sound)
-        episodes = _record(episodes, (before.pipeline_state, action), sound)
-        return _advance(episodes, after, step, start(env, reset_key, sound.shape[0])), step
+        step = Transition(before.obs, action, log_prob, after.reward, terminated, truncated, after.obs, valid)  # pyright: ignore[reportArgumentType]
+        step = _quarantine(step, valid)
+        episodes = _record(episodes, (before.pipeline_state, action), valid)
+        return _advance(episodes, after, step, start(env, reset_key, valid.shape[0])), step
 
     return jax.lax.scan(one, episodes, jax.random.split(key, horizon))

@@ -13,7 +13,7 @@ Params = Any
 
 
 class Transition(NamedTuple):
-    """What a rollout leaves behind. `next_obs` is the true successor, never a reset observation."""
+    """The data of a rollout. `next_obs` is the true successor, never a reset observation."""
 
     obs: Float[Array, "T N O"]
     action: Float[Array, "T N A"]
@@ -22,14 +22,14 @@ class Transition(NamedTuple):
     terminated: Bool[Array, "T N"]
     truncated: Bool[Array, "T N"]
     next_obs: Float[Array, "T N O"]
-    sound: Bool[Array, "T N"]
-    """False where the world turned non-finite: nothing learns from that step."""
+    valid: Bool[Array, "T N"]
+    """False where the world turned non-finite: that step weighs nothing in any loss, standardisation or running scale."""
 
 
 class Batch(NamedTuple):
-    """What the updates learn from; observations are normalised, rewards scaled.
+    """The samples that the updates learn from; observations are normalised, rewards scaled.
 
-    `reward`, `discount` and `next_obs` are there for targets that follow the critic.
+    `reward`, `discount` and `next_obs` serve targets that are recomputed with the current critic.
     """
 
     obs: Float[Array, "B O"]
@@ -40,8 +40,8 @@ class Batch(NamedTuple):
     reward: Float[Array, " B"]
     discount: Float[Array, " B"]
     next_obs: Float[Array, "B O"]
-    sound: Bool[Array, " B"]
-    """Samples that are False weigh nothing in any loss."""
+    valid: Bool[Array, " B"]
+    """Where False, the sample weighs nothing in any loss."""
 
 
 class Fit(NamedTuple):
@@ -51,21 +51,29 @@ class Fit(NamedTuple):
     opt_state: Any
 
 
+class Fitted(NamedTuple):
+    """A network as it is used: all that is needed to act, or to predict."""
+
+    params: Params
+    observations: Any
+    """Running mean and standard deviation by which observations are normalised; None if they are used as they are."""
+
+
 class TrainState(NamedTuple):
     """Everything an iteration reads and writes; the whole of a run."""
 
     policy: Fit
     critic: Fit
     observations: Any
-    """Running mean and deviation of observations."""
-    returns: Any
-    """Running deviation of discounted returns, the scale of rewards."""
+    """Running mean and standard deviation of observations; None if they are not normalised."""
+    reward_scale: Any
+    """Running standard deviation of discounted returns, by which rewards are divided."""
     episodes: Any
     """The worlds and the bookkeeping of their episodes."""
     key: Key[Array, ""]
     iteration: Int[Array, ""]
     failures: Int[Array, ""]
-    """Iterations in a row whose update was not finite and was left out."""
+    """Iterations in a row in which an update was not finite and was left out, or more than half of the world steps were invalid."""
 
 
 class Policy(NamedTuple):
@@ -76,14 +84,14 @@ class Policy(NamedTuple):
 
 
 class Critic(NamedTuple):
-    """A value distribution: how it predicts, what it is fitted to, and how far off it is."""
+    """A value distribution: its prediction, the target it is fitted to, and the loss between the two."""
 
     init: Callable
     """`init(key) -> params`."""
     predict: Callable
     """`predict(params, obs [..., O]) -> quantiles [..., K]`."""
     target: Callable
-    """`target(key, reward, discount, trace, quantiles, next_quantiles) -> [T, N, J]`, frozen for the iteration."""
+    """`target(key, reward, discount, trace, quantiles, next_quantiles) -> [T, N, J]`, of the critic that acted."""
     loss: Callable
     """`loss(params, batch) -> (scalar, info)`."""
 

@@ -1,4 +1,4 @@
-"""How parameters move: the surrogate objective, stochastic gradient steps on any loss, and the trust region."""
+"""Updates of parameters: the surrogate objective, stochastic gradient steps on any loss, and the trust region."""
 
 from collections.abc import Callable
 
@@ -14,15 +14,23 @@ Loss = Callable[[Params, Batch], tuple[jax.Array, dict[str, jax.Array]]]
 """`loss(params, batch) -> (scalar, info)`; info holds scalars worth logging."""
 
 
+LOG_RATIO_LIMIT = 20.0
+"""Largest |log ρ|: beyond a ratio of e²⁰ ≈ 5·10⁸, or its inverse, a sample counts as one at the limit and has no gradient.
+
+PPO's clip and TRPO's radius act at ratios near 1, so nothing changes there; float32 overflows at log ρ = 88.7.
+"""
+
+
 def surrogate(policy: Policy, clip: ArrayLike = jnp.inf) -> Loss:
     """−E[min(ρA, clip(ρ, 1 ± ε)A)], ρ = π(a|s)/π_old(a|s) (Schulman et al. 2017); without a clip, plain ρA.
 
-    At the policy that acted its gradient is that of −E[A log π] (Eq. gradient_obj_fcn).
+    At the policy that acted its gradient is that of −E[A log π] (Eq. gradient_obj_fcn). ρ is bounded by `LOG_RATIO_LIMIT`.
     """
 
     def loss(params: Params, batch: Batch):
         distribution = policy.apply(params, batch.obs)
-        log_ratio = jnp.where(batch.sound, gaussian.log_prob(distribution, batch.action) - batch.log_prob, 0)
+        log_ratio = jnp.where(batch.valid, gaussian.log_prob(distribution, batch.action) - batch.log_prob, 0)
+        log_ratio = jnp.clip(log_ratio, -LOG_RATIO_LIMIT, LOG_RATIO_LIMIT)
         ratio = jnp.exp(log_ratio)
         clipped = jnp.clip(ratio, jnp.subtract(1, clip), jnp.add(1, clip))
         gain = jnp.minimum(ratio * batch.advantage, clipped * batch.advantage)
@@ -66,11 +74,12 @@ def sgd(loss: Loss, optimizer: optax.GradientTransformation, *, epochs: int, min
 def trust_region(
     policy: Policy, loss: Loss, *, radius: ArrayLike, damping: ArrayLike, cg_iterations: int, backtracks: int, fisher_every: int
 ) -> Update:
-    """The natural gradient step to a KL radius, halved until KL and improvement are real (TRPO, Schulman et al. 2015).
+    """The natural gradient step to a KL radius, halved until KL and loss accept it (TRPO, Schulman et al. 2015).
 
     The direction solves (F + damping) x = −∇loss by `cg_iterations` of conjugate gradient, with the Fisher matrix F of every
     `fisher_every`-th sample. A step is taken only if KL(old ‖ new) ≤ `radius` and the loss falls; if none of 1 + `backtracks`
-    lengths is such a step, the parameters stay as they are, bit for bit.
+    lengths is such a step, the parameters stay as they are, bit for bit. As in the paper of TRPO the divergence is that of the
+    whole action, summed over its A dimensions; where it is averaged over them (sb3-contrib), radius and damping are ours over A.
     """
 
     def step(key: jax.Array, fit: Fit, batch: Batch):
@@ -150,7 +159,7 @@ def descent(optimizer: Callable, learning_rate, *, final_fraction, gradient_step
 def descend(
     loss: Loss, iterations: ArrayLike, *, optimizer, learning_rate, learning_rate_end, epochs: int, minibatches: int, max_grad_norm
 ) -> Update:
-    """`sgd` on a loss, with the schedule of a run of so many iterations."""
+    """`sgd` on a loss, with a learning rate that falls over a run of `iterations`."""
     steps = iterations * epochs * minibatches
     rule = descent(optimizer, learning_rate, final_fraction=learning_rate_end, gradient_steps=steps, max_norm=max_grad_norm)
     return sgd(loss, rule, epochs=epochs, minibatches=minibatches)
@@ -167,5 +176,5 @@ def policy_gradient(policy: Policy, iterations: ArrayLike, **fit) -> Update:
 
 
 def natural_gradient(policy: Policy, iterations: ArrayLike, **search) -> Update:
-    """TRPO: the surrogate's step within a trust region."""
+    """TRPO: a natural gradient step on the surrogate within a trust region."""
     return trust_region(policy, surrogate(policy), **search)

@@ -17,7 +17,7 @@ Mask = Bool[Array, "T *batch"] | Float[Array, "T *batch"]
 
 
 class Decay(NamedTuple):
-    """How far value reaches back: γ(1 − terminated) through the bootstrap, λ(1 − done) along the trace."""
+    """The factors of the bootstrap, γ(1 − terminated), and of the trace, λ(1 − done)."""
 
     discount: Float[Array, "T *batch"]
     trace: Float[Array, "T *batch"]
@@ -118,7 +118,7 @@ def n_step_advantage(
     return directional_metric(reward[..., None] + discount * successor, quantiles, weights)
 
 
-# ---- what a critic is fitted to: five targets, from predictions of the critic that acted ----
+# ---- critic targets, from predictions of the critic that acted ----
 
 
 def bellman_target(

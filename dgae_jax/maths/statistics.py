@@ -1,4 +1,4 @@
-"""How good predictions are, and how sure a mean over seeds is."""
+"""Quality of predictions, and the uncertainty of a mean over seeds."""
 
 from collections.abc import Callable
 
@@ -24,18 +24,28 @@ def pit(quantiles: Float[Array, "*batch K"], outcome: Float[Array, "*batch"]) ->
 
 
 def coverage(quantiles: Float[Array, "*batch K"], outcome: Float[Array, "*batch"], level: float = 0.9) -> Float[Array, ""]:
-    """Share of outcomes inside the central interval that should hold `level` of them."""
+    """Share of outcomes inside the central interval that should hold `level` of them; K quantiles give levels up to 1 − 1/K.
+
+    NaN for higher levels, 0.9 with K < 10: the ends of the interval, F⁻¹((1 ± level)/2), then lie outside the midpoints 1/2K …
+    1 − 1/2K. Ending it at the outermost ones would hold only 1 − 1/K of the outcomes of a calibrated critic, and an
+    extrapolation would assume a shape of the tails.
+    """
     if not 0 < level < 1:
         raise ValueError(f"the level of an interval is {level}; it must lie between 0 and 1")
-    tail = (1 - level) / 2
-    grid, ordered = quantile_midpoints(quantiles.shape[-1]), jnp.sort(quantiles)
+    tail, k = (1 - level) / 2, quantiles.shape[-1]
+    if tail < (1 - 1e-9) / (2 * k):
+        return jnp.full((), jnp.nan)
+    grid, ordered = quantile_midpoints(k), jnp.sort(quantiles)
     at = jnp.vectorize(lambda q, z: jnp.interp(q, grid, z), signature="(),(k)->()")
     return ((at(tail, ordered) <= outcome) & (outcome <= at(1 - tail, ordered))).mean()
 
 
 def crps(quantiles: Float[Array, "*batch K"], outcome: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
-    """Continuous ranked probability score, 2 ∫ ρ_τ(y − F⁻¹(τ)) dτ with the pinball loss ρ at the midpoints; lower is better."""
-    u = outcome[..., None] - quantiles
+    """Continuous ranked probability score, 2 ∫ ρ_τ(y − F⁻¹(τ)) dτ with the pinball loss ρ at the midpoints; lower is better.
+
+    Quantiles are sorted first, because a network's may cross.
+    """
+    u = outcome[..., None] - jnp.sort(quantiles)
     tau = quantile_midpoints(quantiles.shape[-1])
     return 2 * (u * (tau - (u < 0))).mean(-1)
 

@@ -11,8 +11,9 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from dgae_jax.configs.build import Fitted, make_greedy, make_quantiles, make_task
+from dgae_jax.configs.build import make_greedy, make_quantiles, make_task
 from dgae_jax.configs.config import Config, ConfigError, resolve
+from dgae_jax.learn.types import Fitted
 from dgae_jax.run import directory, loop, metrics, restore, terminal
 from dgae_jax.run.options import RunOptions
 from dgae_jax.run.training import RunError

@@ -11,11 +11,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from dgae_jax.configs.build import Fitted, make_greedy, make_task, make_trainer
+from dgae_jax.configs.build import make_greedy, make_task, make_trainer
 from dgae_jax.configs.config import Config, invalid
 from dgae_jax.envs.registry import spec_of
 from dgae_jax.learn import play
 from dgae_jax.learn.parallel import Trainer
+from dgae_jax.learn.types import Fitted
 from dgae_jax.run import restore
 from dgae_jax.run.compiling import Watch, compile_aside, unwatched
 from dgae_jax.run.summary import over_seeds, summary

@@ -7,10 +7,10 @@ from typing import Any, NamedTuple, TypeVar
 
 import jax
 
-from dgae_jax.configs.build import Fitted, make_task, make_trainer, seed_keys
+from dgae_jax.configs.build import make_task, make_trainer, seed_keys
 from dgae_jax.configs.config import Config, invalid
 from dgae_jax.configs.serial import MAY_CHANGE, differences
-from dgae_jax.learn.types import TrainState
+from dgae_jax.learn.types import Fitted, TrainState
 from dgae_jax.run import checkpoint, terminal
 from dgae_jax.run.checkpoint import CheckpointError, DamagedError
 from dgae_jax.run.evaluations import EvaluationsFile

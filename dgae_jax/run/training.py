@@ -141,8 +141,9 @@ def _broken(state: TrainState, options: RunOptions) -> bool:
 
 
 def _broke_down(state: TrainState, run_dir: Path) -> str:
-    reason = f"the last {int(state.failures.max())} updates were not finite and were left out"
-    return f"stopped: {reason}; the state before them is in {run_dir}"
+    lately = f"in each of the last {int(state.failures.max())} iterations"
+    reason = f"{lately} updates were not finite and were left out, or most world steps were not finite"
+    return f"stopped: {reason}; the last finite state is in {run_dir}"
 
 
 def _left(run_dir: Path) -> str:

@@ -6,14 +6,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from brax.training.acme import running_statistics
 from numpy.testing import assert_allclose, assert_array_equal
 
 import dgae_jax as dg
 from dgae_jax.configs.build import make_greedy, make_trainer, seed_keys
-from dgae_jax.learn import normalizers
+from dgae_jax.learn import iteration
+from dgae_jax.learn.types import Fit, Update
 from tests.helpers import SMALL, small
-from tests.probes import Coin, Constant, Delayed, Fragile, Target
+from tests.probes import Coin, Constant, Counter, Delayed, Fragile, Target
 
 
 @cache
@@ -166,33 +166,10 @@ def test_a_distributional_critic_finds_the_distribution_of_a_noisy_reward():
 def test_a_world_that_turns_non_finite_is_counted_and_reaches_neither_normaliser_nor_critic_nor_policy(where):
     _, state, rows = learn(Fragile(where, jnp.nan), "dppo", 4, episode_length=6)
     assert (rows["nonfinite"][:, 0] > 0).all()
-    for part in (state.policy, state.critic, state.observations, state.returns):
+    for part in (state.policy, state.critic, state.observations, state.reward_scale):
         assert all(np.isfinite(x).all() for x in jax.tree.leaves(part))
     for name, column in rows.items():
         assert np.isfinite(column).all(), name
-
-
-def test_reward_scaling_divides_by_the_deviation_of_the_discounted_return(key):
-    reward = jax.random.normal(key, (50, 3)) + 1
-    done = jax.random.bernoulli(key, 0.1, (50, 3)).astype(jnp.float32)
-    scale, scaled = normalizers.rescale(normalizers.return_scale(3), reward, done, 0.9)
-    trail, running = np.zeros((50, 3)), np.zeros(3)
-    for t in range(50):
-        running = 0.9 * running + np.asarray(reward[t])
-        trail[t], running = running, running * (1 - np.asarray(done[t]))
-    assert_allclose(scaled, np.asarray(reward) / trail.std(), rtol=1e-4)
-    assert_allclose(scale.discounted, running, rtol=1e-4)
-
-
-def test_observation_statistics_are_those_of_all_samples_seen(key):
-    obs = 3 * jax.random.normal(key, (4, 10, 5, 2)) + 7
-    state = normalizers.observations(2)
-    assert_array_equal(normalizers.normalize(state, obs[0]), jnp.clip(obs[0], -10, 10))
-    for rollout in obs:
-        state = normalizers.observe(state, rollout, jnp.ones((10, 5), bool))
-    assert isinstance(state, running_statistics.RunningStatisticsState)
-    flat = np.asarray(obs).reshape(-1, 2)
-    assert_allclose(normalizers.normalize(state, obs[0]), (np.asarray(obs[0]) - flat.mean(0)) / flat.std(0), rtol=1e-3, atol=1e-4)
 
 
 def test_the_ratio_is_one_before_the_first_step_because_statistics_are_frozen_across_rollout_and_update():
@@ -202,3 +179,97 @@ def test_the_ratio_is_one_before_the_first_step_because_statistics_are_frozen_ac
     _, rows = trainer.dispatch(once, fresh(trainer, once), 3)
     assert_allclose(rows["policy/kl"][:3], 0, atol=1e-6)
     assert_array_equal(rows["policy/clip_fraction"][:3], 0)
+
+
+# ---- one iteration with a part of our own, which shows what the updates are handed ----
+
+
+def iterate(env, iterations=1, *, observations=True, **parts):
+    """States and metrics of a few iterations of PPO with some of its parts replaced; none of its networks moves by itself."""
+    stay = Update(lambda params: (), lambda key, fit, batch: (fit, {"loss": jnp.zeros(())}))
+    config = small("ppo")
+    algorithm = dg.make_algorithm("ppo", env, config)._replace(**{"policy_update": stay, "critic_update": stay, **parts})
+    init, step = iteration.make_train(
+        algorithm, env, num_envs=8, horizon=3, episode_length=100, gamma=0.9, lam=0.9,
+        normalize_observations=observations, normalize_rewards=False,
+    )  # fmt: skip
+    states, rows, step = [init(jax.random.key(0))], [], jax.jit(step)
+    for _ in range(iterations):
+        state, row = step(states[-1])
+        states, rows = [*states, state], [*rows, row]
+    return states, rows
+
+
+def report(**measures):
+    """An update that changes nothing and reports measures of the batch."""
+
+    def step(key, fit, batch):
+        return fit, {"loss": jnp.zeros(()), **{name: measure(batch) for name, measure in measures.items()}}
+
+    return Update(lambda params: (), step)
+
+
+def test_advantages_are_standardised_over_the_valid_steps_alone():
+    seen = report(
+        valid=lambda b: b.valid.sum(),
+        mean=lambda b: b.advantage.mean(where=b.valid),
+        std=lambda b: b.advantage.std(where=b.valid),
+        others=lambda b: jnp.abs(jnp.where(b.valid, 0, b.advantage)).max(),
+    )
+    _, (row,) = iterate(Fragile("reward", jnp.nan), policy_update=seen)
+    assert 0 < 3 * 8 - row["policy/valid"] == row["nonfinite"] < 8
+    assert_allclose([row["policy/mean"], row["policy/std"], row["policy/others"]], [0, 1, 0], atol=1e-5)
+
+
+def test_observations_that_are_not_normalised_are_not_clipped_either():
+    seen = report(largest=lambda b: b.obs.max(), next=lambda b: b.next_obs.max())
+    states, rows = iterate(Counter(), 5, observations=False, policy_update=seen)
+    assert states[-1].observations is None
+    assert [float(row["policy/largest"]) for row in rows] == [2, 5, 8, 11, 14]
+    assert rows[-1]["policy/next"] == 15
+
+
+@pytest.mark.parametrize(("broken", "healthy"), [("policy", "critic"), ("critic", "policy")])
+@pytest.mark.parametrize("what", ["parameters", "optimiser", "loss"])
+def test_an_update_that_is_not_finite_is_left_out_and_the_other_is_not(broken, healthy, what):
+    def spoil(key, fit, batch):
+        params = jax.tree.map(lambda x: x + jnp.where(what == "parameters", jnp.nan, 1), fit.params)
+        moments = jnp.where(what == "optimiser", jnp.inf, 1.0)
+        return Fit(params, moments), {"loss": jnp.where(what == "loss", jnp.nan, 0.0)}
+
+    def move(key, fit, batch):
+        return Fit(jax.tree.map(lambda x: x + 1, fit.params), fit.opt_state), {"loss": jnp.zeros(())}
+
+    start = jnp.zeros(())
+    updates = {f"{broken}_update": Update(lambda params: start, spoil), f"{healthy}_update": Update(lambda params: (), move)}
+    (before, *_, after), rows = iterate(Counter(), 2, **updates)
+    chex.assert_trees_all_equal(getattr(after, broken), getattr(before, broken))
+    chex.assert_trees_all_close(getattr(after, healthy).params, jax.tree.map(lambda x: x + 2, getattr(before, healthy).params))
+    assert [row["skipped"] for row in rows] == [1, 1]
+    assert after.failures == 2
+
+
+class Breaking(Counter):
+    """Its reward is not a number in the given step of every episode."""
+
+    def __init__(self, at):
+        super().__init__()
+        self.at = at
+
+    def step(self, state, action):
+        after = super().step(state, action)
+        return after.replace(reward=jnp.where(after.obs[0] == self.at, jnp.nan, after.reward))
+
+
+@pytest.mark.parametrize(
+    ("at", "failures"),
+    [
+        (1, [1, 2, 3, 4]),  # every step is invalid
+        (2, [0, 1, 0, 1]),  # of three steps one is invalid, then two, then one, …
+        (3, [0, 0, 0, 0]),  # one of three
+    ],
+)
+def test_an_iteration_in_which_more_than_half_of_the_steps_are_invalid_counts_as_a_failure(at, failures):
+    states, rows = iterate(Breaking(at), 4)
+    assert [int(state.failures) for state in states[1:]] == failures
+    assert all(row["skipped"] == 0 for row in rows)

@@ -44,8 +44,8 @@ def test_every_episode_starts_afresh(key):
 
 def test_within_an_episode_the_successor_is_the_next_observation(key):
     _, step = run(Counter(), key)
-    going = ~np.asarray(step.truncated)[:-1]
-    assert_array_equal(np.asarray(step.next_obs)[:-1][going], np.asarray(step.obs)[1:][going])
+    continues = ~np.asarray(step.truncated)[:-1]
+    assert_array_equal(np.asarray(step.next_obs)[:-1][continues], np.asarray(step.obs)[1:][continues])
 
 
 def test_episode_returns_are_undiscounted_sums_and_unknown_before_the_first_end(key):

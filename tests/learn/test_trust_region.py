@@ -61,16 +61,6 @@ def test_damping_adds_a_multiple_of_the_vector():
     assert distance(jax.tree.map(lambda f, p: f + 0.5 * p, product, params), damped) < 1e-6
 
 
-@pytest.mark.parametrize("seed", range(3))
-def test_conjugate_gradient_solves_what_scipy_solves(seed):
-    rng = np.random.default_rng(seed)
-    root = rng.normal(size=(12, 12))
-    matrix, right = root @ root.T + 0.5 * np.eye(12), rng.normal(size=12)
-    with jax.enable_x64(True):
-        got, _ = jax.scipy.sparse.linalg.cg(lambda x: jnp.asarray(matrix) @ x, jnp.asarray(right), maxiter=60, tol=1e-10)
-    assert_allclose(got, scipy.linalg.solve(matrix, right, assume_a="pos"), rtol=1e-6)
-
-
 @pytest.mark.parametrize("seed", range(5))
 @pytest.mark.parametrize("radius", [1e-3, 1e-2, 0.1])
 def test_an_accepted_step_stays_within_the_radius_and_improves(seed, radius):
@@ -121,12 +111,12 @@ def independent_step(params, batch, radius, damping):
 
     eye, step = np.eye(len(flat)), 1e-6
     jacobian = np.stack([(mean(flat + step * e) - mean(flat - step * e)) / (2 * step) for e in eye], -1)  # [B, A, P]
-    deviation = np.exp(flat[at["s"]])
-    standard = (action - mean(flat)) / deviation
-    score = np.einsum("ba,bap->bp", standard / deviation, jacobian)
+    std = np.exp(flat[at["s"]])
+    standard = (action - mean(flat)) / std
+    score = np.einsum("ba,bap->bp", standard / std, jacobian)
     score[:, at["s"]] += standard**2 - 1
     gradient = (advantage[:, None] * score).mean(0)
-    scaled = jacobian / deviation[:, None]
+    scaled = jacobian / std[:, None]
     fisher = np.einsum("bap,baq->pq", scaled, scaled) / len(obs)
     fisher[at["s"], at["s"]] += 2
     direction = scipy.linalg.solve(fisher + damping * eye, gradient, assume_a="pos")
@@ -143,3 +133,36 @@ def test_the_step_is_that_of_an_independent_implementation(seed):
     theirs = independent_step(params, batch, 1e-4, 0.1)
     assert ours @ theirs / np.linalg.norm(ours) / np.linalg.norm(theirs) > 0.999
     assert_allclose(np.linalg.norm(ours), np.linalg.norm(theirs), rtol=0.01)
+
+
+def step_of_sb3_contrib(params, batch, radius, damping):
+    """TRPO in the convention of sb3-contrib, by dense matrices: the KL divergence is averaged over the action's dimensions too.
+
+    There `kl_divergence(old, new).mean()` is a mean over an array [B, A], because PyTorch's Normal is a distribution of one number.
+    """
+    flat, unravel = ravel_pytree(params)
+    old = POLICY.apply(params, batch.obs)
+
+    def divergence(x):
+        new = POLICY.apply(unravel(x), batch.obs)
+        p, q = jnp.exp(2 * old.log_std), jnp.exp(2 * new.log_std)
+        return (new.log_std - old.log_std + (p + (old.mean - new.mean) ** 2) / (2 * q) - 0.5).mean()
+
+    gradient = jax.grad(lambda x: surrogate(POLICY)(unravel(x), batch)[0])(flat)
+    damped = np.asarray(jax.hessian(divergence)(flat) + damping * jnp.eye(len(flat)), np.float64)
+    direction = scipy.linalg.solve(damped, -np.asarray(gradient, np.float64), assume_a="pos")
+    return direction * np.sqrt(2 * radius / (direction @ damped @ direction))
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_sb3_contribs_radius_and_damping_are_ours_over_the_number_of_action_dimensions(seed):
+    # (F/A + d) x = g and the radius r there, (F + A·d) y = g and A·r here: y = x/A, and the lengths make up for it
+    params, batch = example(seed)
+    actions, radius, damping = batch.action.shape[-1], 5e-5, 0.1
+    new, info = move(update(radius=actions * radius, damping=actions * damping, cg_iterations=60), params, batch)
+    assert (info["accepted"], info["halvings"]) == (1, 0)
+    ours = np.asarray(ravel_pytree(new)[0], np.float64) - np.asarray(ravel_pytree(params)[0], np.float64)
+    theirs = step_of_sb3_contrib(params, batch, radius, damping)
+    assert np.linalg.norm(ours - theirs) < 1e-3 * np.linalg.norm(theirs)
+    unscaled = step_of_sb3_contrib(params, batch, actions * radius, actions * damping)
+    assert np.linalg.norm(ours - unscaled) > 0.1 * np.linalg.norm(theirs)

@@ -60,6 +60,27 @@ def test_the_clip_stops_gradient_where_the_ratio_has_moved_with_the_advantage(po
     assert_allclose(surrogate(policy, 0.2)(params, down)[0], jnp.e, rtol=1e-5)
 
 
+@pytest.mark.parametrize("clip", [0.2, jnp.inf])
+@pytest.mark.parametrize("log_ratio", [200.0, -200.0])
+def test_a_ratio_that_overflows_is_bounded_and_leaves_the_gradient_of_the_others(clip, log_ratio, policy, params, batch):
+    wild = batch._replace(log_prob=batch.log_prob.at[5].add(-log_ratio), advantage=batch.advantage.at[5].set(-1.0))
+    without = batch._replace(valid=batch.valid.at[5].set(False), advantage=batch.advantage.at[5].set(0))
+    (value, info), got = jax.value_and_grad(surrogate(policy, clip), has_aux=True)(params, wild)
+    assert all(jnp.isfinite(x) for x in (value, *info.values()))
+    assert distance(got, jax.grad(surrogate(policy, clip), has_aux=True)(params, without)[0]) < 1e-6
+
+
+def test_the_bound_of_the_ratio_is_exact_below_e_to_the_twentieth(policy, params, batch):
+    moved = batch._replace(log_prob=batch.log_prob + jnp.linspace(-19.9, 19.9, 24))
+
+    def unbounded(p):
+        return -(jnp.exp(gaussian.log_prob(policy.apply(p, moved.obs), moved.action) - moved.log_prob) * moved.advantage).mean()
+
+    got, want = jax.grad(surrogate(policy), has_aux=True)(params, moved)[0], jax.grad(unbounded)(params)
+    for a, b in zip(jax.tree.leaves(got), jax.tree.leaves(want), strict=True):
+        assert_allclose(a, b, rtol=1e-5)
+
+
 def test_one_epoch_of_one_minibatch_is_one_optimizer_step_on_the_whole_batch_whatever_the_clip(policy, params, batch, key):
     optimizer = optax.adam(1e-2)
     results = [
@@ -119,11 +140,11 @@ def critic_of(kind, target):
     return critics.scalar(3, **options) if kind == "scalar" else critics.quantile(3, **options, quantiles=4, kappa=1.0)
 
 
-def test_a_sample_that_is_not_sound_weighs_nothing_in_policy_and_critic(policy, params, batch, key):
+def test_an_invalid_sample_weighs_nothing_in_policy_and_critic(policy, params, batch, key):
     critic = critics.quantile(3, hidden=(4,), target=critics.SR_LAMBDA, quantiles=1, kappa=1.0)
     values = critic.init(key)
     broken = batch._replace(
-        sound=batch.sound.at[5].set(False),
+        valid=batch.valid.at[5].set(False),
         advantage=batch.advantage.at[5].set(0),
         action=batch.action.at[5].set(0),
         log_prob=batch.log_prob.at[5].set(-1e4),
@@ -147,7 +168,7 @@ def test_every_critic_takes_every_target(kind, target, key):
     assert got.shape == (6, 5, 1 if target == "lambda-return" else z.shape[-1])
     empty = jnp.zeros(30)
     columns = obs.reshape(30, 3), empty[:, None], empty, empty, got.reshape(30, -1), reward.ravel(), factor.ravel(), next_obs.reshape(30, 3)
-    flat = Batch(*columns, sound=jnp.ones(30, bool))
+    flat = Batch(*columns, valid=jnp.ones(30, bool))
     gradient = jax.grad(critic.loss, has_aux=True)(params, flat)[0]
     assert 0 < float(optax.global_norm(gradient)) < 1e3
 

@@ -11,7 +11,7 @@ import dgae_jax as dg
 def test_explained_variance_is_one_for_the_truth_and_zero_for_a_constant():
     y = jnp.array([1.0, 2.0, 4.0])
     assert_allclose(dg.explained_variance(y, y), 1.0)
-    assert_allclose(dg.explained_variance(y + 3, y), 1.0, atol=1e-6)  # a constant offset is not its business
+    assert_allclose(dg.explained_variance(y + 3, y), 1.0, atol=1e-6)  # variance does not see a constant offset
     assert_allclose(dg.explained_variance(jnp.full(3, 7.0), y), 0.0, atol=1e-6)
     assert jnp.isnan(dg.explained_variance(y, jnp.ones(3)))
 
@@ -27,6 +27,27 @@ def test_a_true_distribution_has_uniform_pit_and_nominal_coverage(key):
     assert_allclose(np.histogram(dg.pit(z, y), 8, (0, 1))[0] / 20_000, 1 / 8, atol=0.02)
     assert_allclose(dg.coverage(z, y, 0.9), 0.9, atol=0.015)
     assert_allclose(dg.coverage(0.5 * z, y, 0.9), 2 * scipy.stats.norm.cdf(0.5 * 1.6449) - 1, atol=0.015)
+
+
+@pytest.mark.parametrize("k", [1, 2, 4, 9])
+def test_fewer_than_ten_quantiles_say_nothing_of_the_central_ninety_percent(k):
+    # the outermost midpoints 1/2K and 1 − 1/2K enclose 1 − 1/K of a calibrated critic's outcomes: less than 0.9 for K < 10
+    y = jnp.linspace(0, 1, 1001)
+    assert jnp.isnan(dg.coverage(jnp.broadcast_to(dg.quantile_midpoints(k), (1001, k)), y, 0.9))
+
+
+@pytest.mark.parametrize("of", [scipy.stats.uniform, scipy.stats.norm])
+@pytest.mark.parametrize(("k", "level"), [(10, 0.9), (16, 0.9), (2, 0.5), (4, 0.75), (8, 0.5)])
+def test_exact_quantiles_have_nominal_coverage_up_to_the_outermost_of_them(of, k, level):
+    y = jnp.asarray(of.ppf((np.arange(10_000) + 0.5) / 10_000), jnp.float32)
+    z = jnp.asarray(of.ppf(np.asarray(dg.quantile_midpoints(k))), jnp.float32)
+    assert_allclose(dg.coverage(jnp.broadcast_to(z, (10_000, k)), y, level), level, atol=0.015)  # between midpoints a line
+
+
+def test_crps_does_not_depend_on_the_order_of_the_quantiles():
+    # sorted 0, 1, 2 with τ = 1/6, 1/2, 5/6 and outcome 1: u = 1, 0, −1, so 2/3 · (1·1/6 + 0 + 1·1/6) = 2/9
+    for z in ([0.0, 1.0, 2.0], [2.0, 1.0, 0.0], [1.0, 2.0, 0.0]):
+        assert_allclose(dg.crps(jnp.array(z), jnp.float32(1.0)), 2 / 9, rtol=1e-6)
 
 
 def test_crps_of_a_point_is_the_distance_to_it():

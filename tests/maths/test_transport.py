@@ -67,16 +67,10 @@ def test_weights_may_be_traced():
     assert_allclose(jax.jit(dg.directional_metric)(u, v, CVAR_HALF), 1.5)
 
 
-@pytest.mark.parametrize("eta", [0.0, 0.5, 2.0])
-def test_lemma_inverse_cdf_of_a_non_negative_multiple_is_the_multiple(eta, key):
-    quantiles = jnp.sort(jax.random.normal(key, (9,)))
-    assert_allclose(jnp.sort(eta * quantiles), eta * quantiles)
-
-
-def test_lemma_needs_a_non_negative_multiple_because_a_negative_one_reverses_the_order():
-    quantiles = jnp.array([0.0, 1.0, 5.0])
-    assert_allclose(jnp.sort(-quantiles), -quantiles[::-1])
-    assert not jnp.allclose(jnp.sort(-quantiles), -quantiles)
+def test_a_negative_factor_does_not_scale_a_preference_because_it_reverses_the_order_of_the_quantiles():
+    # u = 0 1 2 5 and CVaR at ½: ρ(u) = (0 + 1)/2 = ½, ρ(−u) = (−5 − 2)/2 = −3.5 ≠ −½; a positive factor scales it: ρ(2u) = 1
+    u, zero = jnp.array([5.0, 0.0, 2.0, 1.0]), jnp.zeros(4)
+    assert_allclose([dg.directional_metric(f * u, zero, CVAR_HALF) for f in (1.0, 2.0, 0.0, -1.0)], [0.5, 1.0, 0.0, -3.5])
 
 
 @pytest.mark.parametrize("p", [1.0, 2.0])
