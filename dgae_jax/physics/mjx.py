@@ -5,6 +5,7 @@ It takes any model that MJX takes. Where it differs from C MuJoCo, for Ant, is i
 
 import contextlib
 import io
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -42,7 +43,7 @@ def mjx_warp(spec: mujoco.MjSpec, frame_skip: int, reads: Reads) -> Physics:
 
     warp.config.quiet = True
     model, bodies = _compiled(spec, reads, "mjx-warp")
-    device_model = _put(model, "warp", "mjx-warp").tree_replace({"opt._impl.run_rne_postconstraint": reads.forces})
+    device_model: Any = _put(model, "warp", "mjx-warp").tree_replace({"opt._impl.run_rne_postconstraint": reads.forces})
     contacts = upstream.make_data(model, impl="warp")._impl.naconmax
 
     def advance(state: PhysicsState, ctrl: Array) -> PhysicsState:
