@@ -41,7 +41,7 @@ def mjx_warp(spec: mujoco.MjSpec, frame_skip: int, reads: Reads) -> Physics:
     """
     import warp  # pyright: ignore[reportMissingImports]
 
-    warp.config.quiet = True
+    warp.config.log_level = warp.LOG_WARNING  # it announces itself and every kernel that it loads
     model, bodies = _compiled(spec, reads, "mjx-warp")
     device_model: Any = _put(model, "warp", "mjx-warp").tree_replace({"opt._impl.run_rne_postconstraint": reads.forces})
     contacts = upstream.make_data(model, impl="warp")._impl.naconmax
