@@ -1,11 +1,12 @@
-"""Speed, compile time and exactness of the physics, side by side in one run on one core.
+"""Speed, compile time and exactness of the physics engines, side by side in one run.
 
     taskset -c 0 python benchmarks/physics.py
 
-For each task: environment steps per second of C MuJoCo (one thread), of our `mjx` and of stock `mjx.step`, under random
-actions; and the error of one environment step in `mjx` against Gymnasium from the same state, over states visited by
-random and held actions, and by the policies of `--runs` (run directories of experiments/train.py). Nothing else should
-run on the machine meanwhile. With `--device gpu` the JAX rows are measured on the GPU.
+For each task: environment steps per second of each engine under random actions, over those of C MuJoCo on one thread; and
+the error of one environment step in each engine against Gymnasium's v4 task from the same state, over states visited by
+random and held actions and by the policies of `--runs` (run directories of experiments/train.py). On a CPU seconds are
+those that the process used, so keep it on one core. With `--device gpu` the engines in JAX are measured on the GPU, by the
+clock, and nothing else should run on the machine meanwhile.
 """
 
 import dataclasses
@@ -20,15 +21,13 @@ import gymnasium
 import jax
 import jax.numpy as jnp
 import numpy as np
-from mujoco import mjx as mujoco_mjx
 from mujoco.batch import Batch
 
 import dgae_jax as dg
 from dgae_jax.cli.arguments import parse
 from dgae_jax.configs.build import make_greedy, make_task
 from dgae_jax.envs.registry import TASKS
-from dgae_jax.envs.task import load_spec
-from dgae_jax.physics.jax.engine import jax_engine
+from dgae_jax.physics.registry import ENGINES
 from dgae_jax.run import checkpoint, directory
 
 
@@ -38,105 +37,91 @@ class Arguments:
 
     tasks: tuple[str, ...] = tuple(TASKS)
     """Tasks."""
+    engines: tuple[str, ...] = tuple(ENGINES)
+    """Engines; mjx takes up to a minute to compile per task and batch size."""
     worlds: tuple[int, ...] = (64, 512, 2048)
-    """Batch sizes [worlds]."""
-    steps: int = 20
-    """Environment steps per measurement; the fastest of three counts."""
+    """Batch sizes [worlds]; none to leave speeds out."""
+    seconds: float = 1.0
+    """Length of a measurement [s]; the fastest of three counts."""
     states: int = 1000
-    """States to compare at, per source."""
-    stock: bool = True
-    """Measure stock mjx.step too (slow to compile)."""
+    """States to compare at, per source [states]; 0 to leave exactness out."""
     runs: tuple[Path, ...] = ()
     """Run directories whose policies visit states too."""
     device: Literal["cpu", "gpu"] = "cpu"
-    """Device of the JAX rows."""
+    """Device of the engines in JAX."""
     x64: bool = False
-    """Compare in float64."""
+    """Compute in float64; mjx-warp stays in float32."""
+
+    def clock(self) -> float:
+        """On a CPU the seconds that this process used, which on one core other programs disturb least."""
+        return time.process_time() if self.device == "cpu" else time.perf_counter()
 
 
-def fastest(run: Callable[[], Any], times: int = 3) -> float:
-    """Seconds of the fastest of some runs."""
-    seconds = []
-    for _ in range(times):
-        since = time.perf_counter()
-        run()
-        seconds.append(time.perf_counter() - since)
-    return min(seconds)
+def steps_per_second(run: Callable[[int], Any], worlds: int, arguments: Arguments) -> float:
+    """Environment steps per second of `run(count)`, which steps all worlds `count` times."""
+
+    def timed(count: int) -> float:
+        since = arguments.clock()
+        run(count)
+        return arguments.clock() - since
+
+    timed(1)
+    count = max(1, int(arguments.seconds / timed(1)))
+    return worlds * count / min(timed(count) for _ in range(3))
 
 
-def c_speed(name: str, worlds: int, steps: int) -> float:
+def c_speed(name: str, worlds: int, arguments: Arguments) -> float:
     """C MuJoCo on one thread, under new random controls at every step."""
-    task = TASKS[name]
-    model = load_spec(task.FILE["v4"]).compile()
-    batch, rng = Batch(model, worlds, 1), np.random.default_rng(0)
-    controls = rng.uniform(-1, 1, (steps, worlds, model.nu))
+    env: Any = dg.make_env(name, physics="native")
+    model, rng = env._physics.model, np.random.default_rng(0)
+    batch = Batch(model, worlds, 1)
     batch.bind("qpos")[:] = model.qpos0
 
-    def run():
-        for control in controls:
-            batch.bind("ctrl")[:] = control
-            batch.step(nstep=task.FRAME_SKIP)
+    def run(count: int) -> None:
+        for _ in range(count):
+            batch.bind("ctrl")[:] = rng.uniform(-1, 1, (worlds, model.nu))
+            batch.step(nstep=env.FRAME_SKIP)
 
-    run()
-    return worlds * steps / fastest(run)
+    return steps_per_second(run, worlds, arguments)
 
 
-def jax_speed(step: Callable, state: Any, controls: int, worlds: int, steps: int) -> tuple[float, float]:
-    """Environment steps per second and seconds to compile, of a step on one world."""
+def engine_speed(name: str, engine: str, worlds: int, arguments: Arguments) -> tuple[float, float]:
+    """Environment steps per second of an engine, and seconds to compile."""
+    env: Any = dg.make_env(name, physics=engine)
+    physics = env._physics
 
     @jax.jit
-    def run(state, key):
-        def one(state, key):
-            return jax.vmap(step)(state, jax.random.uniform(key, (worlds, controls), minval=-1, maxval=1)), None
+    def run(state, key, count):
+        def one(i, state):
+            ctrl = jax.random.uniform(jax.random.fold_in(key, i), (worlds, physics.model.nu), minval=-1, maxval=1)
+            return jax.vmap(physics.step)(state, ctrl)
 
-        return jax.lax.scan(one, state, jax.random.split(key, steps))[0]
+        return jax.lax.fori_loop(0, count, one, state)
 
-    state = jax.tree.map(lambda x: jnp.broadcast_to(x, (worlds, *jnp.shape(x))), state)
-    since = time.perf_counter()
-    compiled = run.lower(state, jax.random.key(0)).compile()
-    seconds = time.perf_counter() - since
-    state = jax.block_until_ready(compiled(state, jax.random.key(0)))
-    return worlds * steps / fastest(lambda: jax.block_until_ready(compiled(state, jax.random.key(1)))), seconds
-
-
-def ours(name: str, worlds: int, steps: int) -> tuple[float, float]:
-    """Our step."""
-    task = TASKS[name]
-    physics = jax_engine(load_spec(task.FILE["v4"]), task.FRAME_SKIP, max_contacts=task.CONTACTS)
-    start = physics.at_pose(jnp.asarray(physics.model.qpos0), jnp.zeros(physics.model.nv))
-    return jax_speed(physics.step, start, physics.model.nu, worlds, steps)
+    qpos = jnp.broadcast_to(jnp.asarray(physics.model.qpos0), (worlds, physics.model.nq))
+    state = physics.at_pose(qpos, jnp.zeros((worlds, physics.model.nv)))
+    since = arguments.clock()
+    compiled = run.lower(state, jax.random.key(0), 1).compile()
+    compiling = arguments.clock() - since
+    return steps_per_second(lambda n: jax.block_until_ready(compiled(state, jax.random.key(1), n)), worlds, arguments), compiling
 
 
-def stock(name: str, worlds: int, steps: int) -> tuple[float, float]:
-    """`mjx.step` as it comes, without the model's own numerics, through which MJX 3.17 limits the wrong thing."""
-    task, spec = TASKS[name], load_spec(TASKS[name].FILE["v4"])
-    for numeric in list(spec.numerics):
-        spec.delete(numeric)
-    model = spec.compile()
-    m = mujoco_mjx.put_model(model)
-
-    def step(data, control):
-        return jax.lax.scan(lambda d, _: (mujoco_mjx.step(m, d), None), data.replace(ctrl=control), None, length=task.FRAME_SKIP)[0]
-
-    return jax_speed(step, mujoco_mjx.make_data(m), model.nu, worlds, steps)
-
-
-def speeds(name: str, arguments: Arguments) -> None:
-    """A row per batch size."""
-    for worlds in arguments.worlds:
-        reference = c_speed(name, worlds, arguments.steps)
-        speed, compiling = ours(name, worlds, arguments.steps)
-        row = f"{name:9s} {worlds:6,} {reference:9,.0f} {speed:9,.0f} {speed / reference:6.2f} {compiling:7.1f}"
-        if arguments.stock:
-            slow, slow_compiling = stock(name, worlds, max(1, arguments.steps // 10))
-            row += f" {slow:9,.0f} {speed / slow:6.1f} {slow_compiling:7.1f}"
-        print(row, flush=True)
+def speeds(arguments: Arguments) -> None:
+    """A row per task, batch size and engine."""
+    print(f"{'task':9s} {'worlds':>6s} {'engine':9s} {'steps/s':>9s} {'/ C':>6s} {'compile s':>9s}")
+    for name in arguments.tasks:
+        for worlds in arguments.worlds:
+            reference = c_speed(name, worlds, arguments)
+            print(f"{name:9s} {worlds:6,} {'C':9s} {reference:9,.0f} {1:6.2f}", flush=True)
+            for engine in arguments.engines:
+                speed, compiling = engine_speed(name, engine, worlds, arguments)
+                print(f"{name:9s} {worlds:6,} {engine:9s} {speed:9,.0f} {speed / reference:6.2f} {compiling:9.1f}", flush=True)
 
 
 def gymnasium_task(name: str):
     """Gymnasium's v4 task."""
     gymnasium.logger.min_level = gymnasium.logger.ERROR
-    return gymnasium.make(f"{TASKS[name].NAME}-v4").unwrapped
+    return gymnasium.make(TASKS[name].referees["v4"]).unwrapped
 
 
 def visited(name: str, count: int, act: Callable[[np.ndarray], np.ndarray] | None, dtype: type) -> tuple[np.ndarray, ...]:
@@ -153,25 +138,43 @@ def visited(name: str, count: int, act: Callable[[np.ndarray], np.ndarray] | Non
     return tuple(np.stack(x) for x in zip(*kept[:count], strict=True))
 
 
-def errors(name: str, poses: tuple[np.ndarray, ...]) -> str:
-    """Observation and reward errors of one step of our `mjx` from each pose."""
-    env, gym = dg.make_env(name, physics="jax"), gymnasium_task(name)
+def gymnasium_steps(name: str, poses: tuple[np.ndarray, ...]) -> tuple[np.ndarray, np.ndarray, int]:
+    """Observation and reward of one step of Gymnasium's task from each pose, and the most contacts seen."""
+    gym, observations, rewards, contacts = gymnasium_task(name), [], [], 0
+    for qpos, qvel, action in zip(*poses, strict=True):
+        gym.reset()
+        gym.set_state(qpos.astype(float), qvel.astype(float))
+        obs, reward, *_ = gym.step(action)
+        observations.append(obs)
+        rewards.append(float(reward))
+        contacts = max(contacts, gym.data.ncon)
+    return np.stack(observations), np.array(rewards), contacts
+
+
+def errors(name: str, engine: str, poses: tuple[np.ndarray, ...], observations: np.ndarray, rewards: np.ndarray) -> str:
+    """Observation and reward errors of one step in an engine from each pose."""
+    env = dg.make_env(name, physics=engine)
 
     @jax.jit
     def step(key, qpos, qvel, action):
         return jax.vmap(lambda q, v, a: env.step(env.set_state(env.reset(key), q, v), a))(qpos, qvel, action)
 
     after = step(jax.random.key(0), *map(jnp.asarray, poses))
-    observation, reward, contacts = [], [], []
-    for i, (qpos, qvel, action) in enumerate(zip(*poses, strict=True)):
-        gym.reset()
-        gym.set_state(qpos.astype(float), qvel.astype(float))
-        obs, theirs, *_ = gym.step(action)
-        observation.append(np.abs(obs - np.asarray(after.obs[i])).max())
-        reward.append(abs(float(theirs) - float(after.reward[i])))
-        contacts.append(gym.data.ncon)
-    median, most, worst = np.quantile(observation, (0.5, 0.99, 1))
-    return f"{median:9.1e} {most:9.1e} {worst:9.1e} {max(reward):9.1e} {max(contacts):8d}"
+    median, most, worst = np.quantile(np.abs(observations - np.asarray(after.obs)).max(1), (0.5, 0.99, 1))
+    return f"{median:9.1e} {most:9.1e} {worst:9.1e} {np.abs(rewards - np.asarray(after.reward)).max():9.1e}"
+
+
+def exactness(arguments: Arguments) -> None:
+    """A row per task, source of states and engine."""
+    print(f"one step against Gymnasium, {'float64' if arguments.x64 else 'float32'}: error of the observation and the reward")
+    print(f"{'task':9s} {'states of':9s} {'engine':9s} {'median':>9s} {'99 %':>9s} {'worst':>9s} {'reward':>9s} {'contacts':>8s}")
+    policies = [(name, None) for name in arguments.tasks] + [policy_of(run) for run in arguments.runs]
+    for name, act in policies:
+        poses = visited(name, arguments.states, act, np.float64 if arguments.x64 else np.float32)
+        observations, rewards, contacts = gymnasium_steps(name, poses)
+        for engine in arguments.engines:
+            row = errors(name, engine, poses, observations, rewards)
+            print(f"{name:9s} {'a policy' if act else 'random':9s} {engine:9s} {row} {contacts:8d}", flush=True)
 
 
 def policy_of(run_dir: Path) -> tuple[str, Callable[[np.ndarray], np.ndarray]]:
@@ -190,23 +193,15 @@ def policy_of(run_dir: Path) -> tuple[str, Callable[[np.ndarray], np.ndarray]]:
 
 def main() -> None:
     """Print both tables."""
-    arguments = parse(Arguments, "Speed and exactness of the physics.")
+    arguments = parse(Arguments, "Speed and exactness of the physics engines.")
     jax.config.update("jax_enable_compilation_cache", False)
     jax.config.update("jax_platforms", {"cpu": "cpu", "gpu": "cuda"}[arguments.device])
     jax.config.update("jax_enable_x64", arguments.x64)
     warnings.simplefilter("ignore")
     print(f"{jax.devices()[0].device_kind}, jax {jax.__version__}; environment steps per second")
-    print(f"{'task':9s} {'worlds':>6s} {'C':>9s} {'mjx':>9s} {'/ C':>6s} {'compile':>7s} {'stock':>9s} {'×':>6s} {'compile':>7s}")
-    for name in arguments.tasks:
-        speeds(name, arguments)
-    print(f"one step against Gymnasium, {'float64' if arguments.x64 else 'float32'}: error of the observation and the reward")
-    print(f"{'task':9s} {'states of':12s} {'median':>9s} {'99 %':>9s} {'worst':>9s} {'reward':>9s} {'contacts':>8s}")
-    dtype = np.float64 if arguments.x64 else np.float32
-    policies = [(name, None) for name in arguments.tasks] + [policy_of(run) for run in arguments.runs]
-    for name, act in policies:
-        if name in arguments.tasks:
-            poses = visited(name, arguments.states, act, dtype)
-            print(f"{name:9s} {'a policy' if act else 'random':12s} {errors(name, poses)}", flush=True)
+    speeds(arguments)
+    if arguments.states:
+        exactness(arguments)
 
 
 if __name__ == "__main__":

@@ -5,6 +5,7 @@ It takes any model that MJX takes. Where it differs from C MuJoCo, for Ant, is i
 
 import contextlib
 import io
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -40,9 +41,9 @@ def mjx_warp(spec: mujoco.MjSpec, frame_skip: int, reads: Reads) -> Physics:
     """
     import warp  # pyright: ignore[reportMissingImports]
 
-    warp.config.quiet = True
+    warp.config.log_level = warp.LOG_WARNING  # it announces itself and every kernel that it loads
     model, bodies = _compiled(spec, reads, "mjx-warp")
-    device_model = _put(model, "warp", "mjx-warp").tree_replace({"opt._impl.run_rne_postconstraint": reads.forces})
+    device_model: Any = _put(model, "warp", "mjx-warp").tree_replace({"opt._impl.run_rne_postconstraint": reads.forces})
     contacts = upstream.make_data(model, impl="warp")._impl.naconmax
 
     def advance(state: PhysicsState, ctrl: Array) -> PhysicsState:

@@ -1,5 +1,8 @@
 """MuJoCo MJX: how worlds are vmapped, and what is refused."""
 
+import subprocess
+import sys
+
 import jax
 import jax.numpy as jnp
 import mujoco
@@ -9,6 +12,7 @@ from numpy.testing import assert_allclose
 from dgae_jax.envs.task import load_spec
 from dgae_jax.physics.engine import Reads
 from dgae_jax.physics.registry import make_physics
+from tests.helpers import ROOT
 from tests.parity import WARP, reference, states
 
 
@@ -48,3 +52,15 @@ def test_the_models_numerics_which_mjx_misreads_are_left_out_of_a_copy():
     assert len(spec.numerics) == 1
     assert make_physics("mjx", spec, 5, Reads()).model.nnumeric == 0
     assert len(spec.numerics) == 1
+
+
+@WARP
+def test_warp_announces_neither_itself_nor_its_kernels():
+    code = """
+import jax, jax.numpy as jnp
+from dgae_jax.envs.task import load_spec
+from dgae_jax.physics.engine import Reads
+from dgae_jax.physics.registry import make_physics
+physics = make_physics("mjx-warp", load_spec("hopper.xml"), 4, Reads())
+jax.block_until_ready(jax.jit(physics.step)(physics.at_pose(jnp.zeros(6), jnp.zeros(6)), jnp.zeros(3)))"""
+    assert subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True).stdout == ""
