@@ -9,7 +9,6 @@ those that the process used, so keep it on one core. With `--device gpu` the eng
 clock, and nothing else should run on the machine meanwhile.
 """
 
-import dataclasses
 import time
 import warnings
 from collections.abc import Callable
@@ -25,10 +24,9 @@ from mujoco.batch import Batch
 
 import dgae_jax as dg
 from dgae_jax.cli.arguments import parse
-from dgae_jax.configs.build import make_greedy, make_task
 from dgae_jax.envs.registry import TASKS
 from dgae_jax.physics.registry import ENGINES
-from dgae_jax.run import checkpoint, directory
+from dgae_jax.run import directory
 
 
 @dataclass(frozen=True)
@@ -179,16 +177,14 @@ def exactness(arguments: Arguments) -> None:
 
 def policy_of(run_dir: Path) -> tuple[str, Callable[[np.ndarray], np.ndarray]]:
     """The task of a run and its mean action."""
-    config = dataclasses.replace(directory.read_config(run_dir), physics="native")
     with jax.enable_x64(False):  # policies are float32
-        state = jax.tree.map(lambda x: x[0], checkpoint.newest(run_dir, config)[0])
-        greedy = jax.jit(make_greedy(make_task(config), config))
+        policy = dg.load_policy(run_dir)
 
     def act(obs: np.ndarray) -> np.ndarray:
         with jax.enable_x64(False):
-            return np.asarray(greedy(state, obs.astype(np.float32)))
+            return policy(obs)
 
-    return config.env, act
+    return directory.read_config(run_dir).env, act
 
 
 def main() -> None:
