@@ -19,17 +19,21 @@ from .maths.risk import METRICS, weights_of
 from .maths.statistics import bootstrap_interval, coverage, crps, explained_variance, iqm, pit
 from .maths.transport import directional_metric, quantile_huber_loss, quantile_midpoints, wasserstein
 from .run.api import Run, load_policy, train
+from .run.checkpoint import CheckpointError
+from .run.training import RunError
 
 __version__: str
 
 __all__ = [
     "METRICS",
+    "CheckpointError",
     "Config",
     "ConfigError",
     "CriticConfig",
     "NoiseConfig",
     "PolicyConfig",
     "Run",
+    "RunError",
     "bellman_target",
     "bootstrap_interval",
     "coverage",

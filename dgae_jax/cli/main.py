@@ -13,7 +13,7 @@ COMMANDS = {
 
 
 def main() -> int:
-    """Run one command; 2 for a name that is none."""
+    """Run one command; 2 for an unknown name."""
     terminal.prepare()
     if len(sys.argv) < 2 or sys.argv[1] in ("-h", "--help"):
         terminal.say("usage: dgae COMMAND [flags]; dgae COMMAND --help lists the flags\n")

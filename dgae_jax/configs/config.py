@@ -160,6 +160,11 @@ class Config(_Settings):
     critic: CriticConfig = field(default_factory=CriticConfig)
 
     @property
+    def task(self) -> str:
+        """The task with its version, where it has one."""
+        return f"{self.env}-{self.env_version}" if self.env_version else self.env
+
+    @property
     def samples_per_iteration(self) -> int:
         """Samples per iteration and run."""
         return self.num_envs * self.horizon

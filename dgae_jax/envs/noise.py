@@ -10,7 +10,7 @@ from dgae_jax.envs.task import Task
 
 
 class Noisy(Wrapper):
-    """A task with normal noise of given deviations, drawn afresh at every step from the key of its reset.
+    """A task with normal noise of given standard deviations, drawn afresh at every step from the key of its reset.
 
     The policy sees and the reward is paid with noise; the physics underneath stays exact. `initial` moves positions and
     velocities at a reset, for our own tasks.

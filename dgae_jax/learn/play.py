@@ -29,7 +29,7 @@ def play(env: Env, act: Callable[[Array], Array], episodes: Play, until: ArrayLi
     """Go on to step number `until`, or to where all are over, with `act(obs [E, O]) -> action [E, A]`."""
     low, high = env.action_range
 
-    def going(episodes: Play):
+    def unfinished(episodes: Play):
         return episodes.alive.any() & (episodes.step < until)
 
     def one(episodes: Play) -> Play:
@@ -37,4 +37,4 @@ def play(env: Env, act: Callable[[Array], Array], episodes: Play, until: ArrayLi
         total = episodes.total + jnp.where(episodes.alive, state.reward, 0)
         return Play(state, total, episodes.alive & (state.done == 0), episodes.step + 1)
 
-    return jax.lax.while_loop(going, one, episodes)
+    return jax.lax.while_loop(unfinished, one, episodes)

@@ -161,7 +161,7 @@ def _check_own(part: Path, kind: str, is_kind: Callable[[int], bool]) -> None:
 
 
 def read_config_file(path: Path) -> Config:
-    """A configuration as JSON; raises ConfigError if it cannot be read or cannot be."""
+    """A configuration as JSON; raises ConfigError if it cannot be read or is invalid."""
     try:
         data = path.read_bytes()
     except (OSError, ValueError) as reason:

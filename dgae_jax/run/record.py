@@ -84,7 +84,7 @@ class Record:
 
     def draw(self) -> None:
         """The learning curve so far."""
-        title = f"{self.config.env}-{self.config.env_version}, {self.config.algo}, {self.config.physics}"
+        title = f"{self.config.task}, {self.config.algo}, {self.config.physics}"
         self._write(_plot, self.run_dir / "curve.png", *self.metrics.curve(), title, self.evaluations.points())
 
     def _save_incidents(self, state: TrainState, seeds: set[int]) -> None:

@@ -158,6 +158,5 @@ def _is_out_of_memory(reason: Exception) -> bool:
 
 def _budget(config: Config) -> str:
     runs, samples = f" × {config.num_seeds} seeds" if config.num_seeds > 1 else "", config.samples_per_iteration
-    task = config.env if config.env_version is None else f"{config.env}-{config.env_version}"
     used = f"{config.iterations:,} iterations × {samples:,} samples = {config.iterations * samples:,}"
-    return f"{task} {config.algo} on {config.physics}: {used} of {config.total_steps:,} steps{runs}"
+    return f"{config.task} {config.algo} on {config.physics}: {used} of {config.total_steps:,} steps{runs}"
