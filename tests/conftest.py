@@ -1,6 +1,7 @@
 """Shapes and dtypes in annotations are checked while tests run; compiled programs are kept between runs."""
 
 import os
+import signal
 import tempfile
 
 import jaxtyping
@@ -11,6 +12,12 @@ import jax  # noqa: E402
 import pytest  # noqa: E402
 
 jax.config.update("jax_compilation_cache_dir", os.path.join(tempfile.gettempdir(), "dgae_jax_tests"))  # noqa: PTH118
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _hang_ups_are_heard():
+    """Also where the tests run under `nohup`, which processes inherit."""
+    signal.signal(signal.SIGHUP, signal.SIG_DFL)
 
 
 @pytest.fixture

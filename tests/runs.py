@@ -9,7 +9,9 @@ from dgae_jax.configs.config import resolve
 from dgae_jax.run import checkpoint, metrics
 from dgae_jax.run.options import RunOptions
 from tests import helpers
-from tests.helpers import SMALL
+
+SMALL = resolve(helpers.SMALL)
+"""As a run has it, with everything written out."""
 
 ITERATIONS = 8
 QUIET = RunOptions(

@@ -9,7 +9,7 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 import dgae_jax as dg
-from dgae_jax.configs.build import make_greedy, make_trainer, seed_keys
+from dgae_jax.configs.build import make_greedy, make_trainer, policies_of, seed_keys
 from dgae_jax.learn import iteration
 from dgae_jax.learn.types import Fit, Update
 from tests.helpers import SMALL, small
@@ -131,6 +131,7 @@ def test_the_policy_finds_the_best_action_for_each_observation(algo):
     env = Target()
     config, state, _ = learn(env, algo, 40)
     greedy = make_greedy(env, config)
+    state = policies_of(state)
     assert_allclose(greedy(state, jnp.array([[-1.0], [1.0]])), [[-0.5], [0.5]], atol=0.1)
 
 

@@ -9,8 +9,7 @@ import pytest
 from dgae_jax.configs.build import make_task, make_trainer, seed_keys
 from dgae_jax.run import training
 from dgae_jax.run.loop import train
-from tests.helpers import SMALL
-from tests.runs import QUIET, small
+from tests.runs import QUIET, SMALL, small
 
 
 @pytest.fixture(scope="session", autouse=True)

@@ -15,8 +15,7 @@ from dgae_jax.run import directory, metrics, restore, training
 from dgae_jax.run import record as record_module
 from dgae_jax.run.loop import resume, train
 from dgae_jax.run.record import Record
-from tests.helpers import SMALL
-from tests.runs import QUIET, last, small, timeless
+from tests.runs import QUIET, SMALL, last, small, timeless
 
 
 @pytest.mark.parametrize("evaluation", [1, 2])

@@ -10,8 +10,8 @@ import pytest
 
 from dgae_jax.run import checkpoint
 from dgae_jax.run.checkpoint import CheckpointError, NotFiniteError
-from tests.helpers import SMALL, signed
-from tests.runs import saved
+from tests.helpers import signed
+from tests.runs import SMALL, saved
 
 
 def plain(state):

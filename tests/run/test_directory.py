@@ -17,8 +17,8 @@ from dgae_jax.configs.serial import to_dict
 from dgae_jax.run import directory, files
 from dgae_jax.run.loop import resume, train
 from dgae_jax.run.options import RunOptions
-from tests.helpers import ROOT, SMALL
-from tests.runs import QUIET, small
+from tests.helpers import ROOT
+from tests.runs import QUIET, SMALL, small
 
 
 def test_a_run_directory_says_what_the_run_is(tmp_path):
@@ -119,7 +119,7 @@ def test_links_where_whole_files_are_written_are_replaced_and_not_followed(name,
 
 def test_the_public_way_to_a_preset_and_back_through_a_file_is_the_same_configuration(tmp_path):
     config = dg.preset("paper", "dtrpo", "ant")
-    files.write_json(tmp_path / "config.json", dataclasses.asdict(config))
+    files.write_json(tmp_path / "config.json", to_dict(config))
     assert directory.read_config_file(tmp_path / "config.json") == config
 
 
@@ -128,7 +128,8 @@ import os, sys
 from pathlib import Path
 from dgae_jax.run import directory, manifest
 from dgae_jax.run.options import RunOptions
-from tests.helpers import ROOT, SMALL
+from tests.helpers import ROOT
+from tests.runs import SMALL
 
 manifest._git_revision = lambda: None
 parent = Path(sys.argv[1])

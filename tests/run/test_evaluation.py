@@ -11,7 +11,7 @@ from dgae_jax.configs.config import ConfigError
 from dgae_jax.run.evaluation import default_path, engines_of, episode_seeds, evaluate_policies
 from dgae_jax.run.evaluations import EvaluationsFile
 from dgae_jax.run.summary import describe, over_seeds, summary
-from tests.helpers import SMALL
+from tests.runs import SMALL
 
 
 def test_an_environment_of_braxs_own_is_evaluated_in_its_own_physics_only(state):
@@ -43,7 +43,7 @@ def test_native_and_gymnasium_give_the_same_policy_the_same_return():
 def test_every_run_has_a_first_engine_and_files_of_their_own_for_each_engine_and_checkpoint(tmp_path):
     assert engines_of(SMALL)[0] == "gymnasium"
     assert {"native", "jax"} <= set(engines_of(SMALL))
-    assert engines_of(dataclasses.replace(SMALL, env="brax:ant", physics="jax")) == ("jax",)
+    assert engines_of(dataclasses.replace(SMALL, env="brax:ant", physics="mjx")) == ("mjx",)
     names = [default_path(tmp_path, engine, which).name for engine in ("native", "jax") for which in ("newest", "best")]
     assert names == ["evaluation-native.json", "evaluation-native-best.json", "evaluation-jax.json", "evaluation-jax-best.json"]
 

@@ -5,7 +5,7 @@ import pytest
 
 from dgae_jax.configs.config import ConfigError
 from dgae_jax.run import machine
-from tests.helpers import SMALL
+from tests.runs import SMALL
 
 
 @pytest.mark.parametrize(

@@ -6,7 +6,7 @@ import numpy as np
 from dgae_jax.configs.build import make_task
 from dgae_jax.run.options import RunOptions
 from dgae_jax.run.record import Record
-from tests.helpers import SMALL
+from tests.runs import SMALL
 
 
 def test_an_incident_can_be_replayed_from_its_file(state, tmp_path):
@@ -22,7 +22,7 @@ def test_an_incident_can_be_replayed_from_its_file(state, tmp_path):
     assert not (tmp_path / "nonfinite").exists()
     record.append(broken, jax.tree.map(lambda x: x[1:], row), 1)
     incident = np.load(tmp_path / "nonfinite" / "steps_000000000128_seed_0.npz")
-    assert set(incident) == {"qpos", "qvel", "warmstart", "torso", "contact", "action"}
+    assert set(incident) == {"qpos", "qvel", "qacc_warmstart", "xpos", "cfrc_ext", "action"}
     env = make_task(SMALL)
     replayed = env.set_state(env.reset(jax.random.key(0)), incident["qpos"], incident["qvel"])
     assert float(replayed.pipeline_state.qpos[2]) == 9

@@ -14,8 +14,8 @@ from dgae_jax.run import record as record_module
 from dgae_jax.run.checkpoint import CheckpointError
 from dgae_jax.run.evaluation import evaluate_run
 from dgae_jax.run.loop import resume, train
-from tests.helpers import SMALL, signed
-from tests.runs import QUIET, saved, small
+from tests.helpers import signed
+from tests.runs import QUIET, SMALL, saved, small
 
 
 def test_the_newest_checkpoints_are_kept_and_the_best(state, tmp_path):

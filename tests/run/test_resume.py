@@ -11,8 +11,7 @@ from dgae_jax.configs.config import ConfigError
 from dgae_jax.run import directory, files, manifest, metrics
 from dgae_jax.run.loop import resume, resume_or_start, train
 from dgae_jax.run.options import RunOptions
-from tests.helpers import SMALL
-from tests.runs import QUIET, last, small, timeless
+from tests.runs import QUIET, SMALL, last, small, timeless
 
 
 def stopped_half_way(whole, half):
@@ -135,15 +134,15 @@ def test_resume_or_start_starts_a_run_and_then_goes_on_with_it(finished, tmp_pat
     assert resume_or_start(small(), options) == 0
     assert last(run_dir).read_bytes() == last(finished).read_bytes()
     assert timeless(run_dir) == timeless(finished)
-    with pytest.raises(ConfigError, match=r"--gamma 0\.5: must be 0\.99 as in"):
+    with pytest.raises(ConfigError, match=r"gamma 0\.5: must be 0\.99 as in"):
         resume_or_start(dataclasses.replace(small(), gamma=0.5), options)
 
 
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"resume_or_start": True}, "--resume-or-start True: must come with the directory to look in, --run-dir DIR"),
-        ({"resume_or_start": True, "resume": Path("x")}, "--resume-or-start True: must be left out: --resume only resumes"),
+        ({"resume_or_start": True}, "resume_or_start True: must be used with the directory to look in, --run-dir DIR"),
+        ({"resume_or_start": True, "resume": Path("x")}, "resume_or_start True: must be left out: --resume only resumes"),
     ],
 )
 def test_resume_or_start_needs_a_directory_and_no_other_way_to_resume(options, message):
