@@ -31,7 +31,7 @@ def peek(argv: Sequence[str], *names: str) -> dict[str, str | None]:
     """The values of some settings, looked at before the rest is parsed; None where there is none."""
     parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False, exit_on_error=False)
     for name in names:
-        parser.add_argument(flag(name), flag(name).replace("-", "_").replace("__", "--", 1), dest=name, nargs="?")
+        parser.add_argument(flag(name), dest=name, nargs="?")
     return vars(parser.parse_known_args(argv)[0])
 
 

@@ -123,7 +123,8 @@ class Config(_Settings):
     env: str = "hopper"
     """Task: ant, hopper, swimmer, walker2d, or brax:NAME for one of Brax's own."""
     env_version: str | None = None
-    """Gymnasium version whose semantics the task has: v4 or v5; unset: v4, or none for one of Brax's own."""
+    """Gymnasium version whose semantics the task has: v4 (Gym's v3, but for Ant's contact forces and their cost) or v5; unset: v4, or
+    none for one of Brax's own."""
     algo: str | None = None
     """Algorithm: ppo, trpo, a2c, or with a value distribution dppo, dtrpo, da2c; unset: dppo."""
     residual: str | None = None

@@ -18,12 +18,17 @@ from dgae_jax.physics.engine import Physics, PhysicsState, Reads, body_ids, refu
 _FIELDS = ("qpos", "qvel", "qacc_warmstart")
 
 
+def cores() -> int:
+    """Cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
 class _Host:
     """Keeps one batch of simulations per batch size; the callback's only memory is these buffers."""
 
     def __init__(self, model: mujoco.MjModel, frame_skip: int, reads: Reads):
         self.model, self.frame_skip, self.reads, self.bodies = model, frame_skip, reads, body_ids(model, reads)
-        self.threads = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+        self.threads = cores()
         self.batches: dict[int, Batch] = {}
         self.data = mujoco.MjData(model)
         self.lock = threading.Lock()  # a Batch serves one caller at a time

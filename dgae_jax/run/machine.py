@@ -8,6 +8,8 @@ from typing import Any
 import jax
 
 from dgae_jax.configs.config import Config, ConfigError, invalid
+from dgae_jax.physics.native import cores
+from dgae_jax.physics.registry import ENGINES
 from dgae_jax.run import terminal
 
 _SETTINGS = ("jax_enable_x64", "jax_default_prng_impl", "jax_threefry_partitionable", "jax_default_matmul_precision")
@@ -22,9 +24,9 @@ def use_device(config: Config) -> None:
         wanted, why = os.environ.get("JAX_PLATFORMS", ""), str(reason) or type(reason).__name__
         gpu = "" if wanted == "cpu" else 'an NVIDIA GPU needs pip install "dgae_jax[cuda13]"; '
         raise ConfigError(f"JAX_PLATFORMS={wanted}: must name a device that JAX finds here, cpu for one; {gpu}JAX says: {why}") from reason
-    if config.physics == "native" and kind != "cpu":
+    if ENGINES[str(config.physics)].on_host and kind != "cpu":
         terminal.warn(
-            f"warning: --physics native simulates on the CPU and everything else runs on the {kind}, so that each step crosses"
+            f"warning: --physics {config.physics} simulates on the CPU and everything else runs on the {kind}, so that each step crosses"
             f" between them; --physics jax or JAX_PLATFORMS=cpu keeps all in one place"
         )
 
@@ -67,7 +69,7 @@ def _cores() -> int | None:
     """Cores this process may use: on a CPU their number decides how sums are split, and so their rounding."""
     if jax.default_backend() != "cpu":
         return None
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+    return cores()
 
 
 def memory() -> int:

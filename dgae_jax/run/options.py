@@ -26,7 +26,7 @@ class RunOptions:
     inexact: bool = False
     """Let --resume continue with another --physics, device, number of cores or versions: the same in the statistical sense only."""
     max_nonfinite: int = 10
-    """Updates in a row that may turn out non-finite, and be left out, before the run is stopped [iterations]."""
+    """Failures in a row before the run is stopped: an update not finite and left out, or most world steps invalid [iterations]."""
     episodes: int = 20
     """Episodes of every evaluation in Gymnasium, per run [episodes]."""
     debug_nonfinite: bool = False

@@ -91,6 +91,8 @@ def test_a_configuration_survives_json(config):
     ("change", "message"),
     [
         (lambda d: d.pop("gamma"), "gamma: missing"),
+        (lambda d: d.pop("schema"), "schema: missing; before schema 2 the engine now called jax had the name mjx"),
+        (lambda d: d.update(schema=3), "schema 3: must be 2"),
         (lambda d: d.update(extra=1), "extra: unknown"),
         (lambda d: d.update(num_envs="16"), "num_envs: must be int"),
         (lambda d: d.update(num_envs=True), "num_envs: must be int"),
