@@ -4,6 +4,7 @@ import dataclasses
 import hashlib
 import importlib
 import json
+import tempfile
 from pathlib import Path
 
 import jax
@@ -34,8 +35,9 @@ def small(algo, **changes):
     return dataclasses.replace(SMALL, algo=algo, policy=policy, critic=critic, **changes)
 
 
-TINY = ["--physics", "native", "--num-envs", "4", "--horizon", "16", "--policy.minibatches", "4", "--critic.minibatches", "4",
-        "--policy.hidden", "8", "--critic.hidden", "8"]  # fmt: skip
+TINY = ["--num-envs", "4", "--horizon", "16", "--policy.minibatches", "4", "--critic.minibatches", "4", "--policy.hidden", "8",
+        "--critic.hidden", "8", "--cache-dir", str(Path(tempfile.gettempdir()) / "dgae_jax_tests")]  # fmt: skip
+"""Flags of a small run, on the engine whose compiled programs are kept between processes."""
 
 
 def command(name):

@@ -32,7 +32,19 @@ def run(monkeypatch, capsys):
 def trained(tmp_path_factory):
     """A finished tiny run: its directory and what it printed."""
     directory = tmp_path_factory.mktemp("runs") / "tiny"
-    argv = ["--total-steps", "1000", "--run-dir", str(directory), "--episodes", "3", "--checkpoint-every", "300", *TINY]
+    argv = [
+        "--total-steps",
+        "1000",
+        "--run-dir",
+        str(directory),
+        "--episodes",
+        "3",
+        "--checkpoint-every",
+        "300",
+        "--physics",
+        "native",
+        *TINY,
+    ]
     done = subprocess.run(
         [sys.executable, "experiments/train.py", *argv], cwd=ROOT, capture_output=True, text=True, check=True, timeout=300
     )

@@ -19,7 +19,7 @@ def start(run_dir, *more):
     if (run_dir / "config.json").exists():
         argv = ["--resume", str(run_dir)]
     else:
-        argv = ["--run-dir", str(run_dir), "--total-steps", str(40 * 64), *TINY]
+        argv = ["--run-dir", str(run_dir), "--total-steps", str(40 * 64), "--physics", "native", *TINY]
     argv += ["--checkpoint-every", str(5 * 64), "--episodes", "1", *more]
     return subprocess.Popen([sys.executable, "experiments/train.py", *argv], cwd=ROOT, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
 
@@ -80,7 +80,19 @@ def test_a_signal_saves_within_half_a_minute_and_a_second_one_ends_at_once(kind,
 @pytest.mark.parametrize(("kind", "code"), [(signal.SIGTERM, 143), (signal.SIGINT, 130), (signal.SIGHUP, 129)])
 def test_a_signal_while_it_compiles_ends_it_at_once(kind, code, tmp_path):
     layers = ["8"] * 32  # half a minute of compilation
-    argv = ["--run-dir", str(tmp_path / "run"), "--total-steps", "640", *TINY, "--policy.hidden", *layers, "--critic.hidden", *layers]
+    argv = [
+        "--run-dir",
+        str(tmp_path / "run"),
+        "--total-steps",
+        "640",
+        "--physics",
+        "native",
+        *TINY,
+        "--policy.hidden",
+        *layers,
+        "--critic.hidden",
+        *layers,
+    ]
     command = [sys.executable, "-u", "experiments/train.py", *argv]
     process = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     for line in process.stdout:

@@ -27,7 +27,7 @@ def stopped_half_way(whole, half):
     ("algo", "physics", "seeds"),
     [
         ("dtrpo", "native", 1),
-        ("ppo", "native", 3),
+        ("a2c", "native", 3),
         *(pytest.param(algo, "native", 1, marks=pytest.mark.slow) for algo in ("ppo", "dppo", "trpo", "a2c", "da2c")),
         pytest.param("dppo", "jax", 1, marks=pytest.mark.slow),
     ],
