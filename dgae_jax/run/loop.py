@@ -111,7 +111,7 @@ def _compare(config: Config, saved: Config, run_dir: Path, inexact: bool) -> Non
         raise ConfigError(f"resume {run_dir}: must go on where it began, or with --inexact; now {elsewhere}", "resume")
     if "physics" in changed:
         ours, theirs = changed["physics"]
-        _warn_of_another_sample(f"physics {ours} (was {theirs}): one step differs by up to 1e-4")
+        _warn_of_another_sample(f"physics {ours} (was {theirs}): one step differs by up to 1e-4, of ant on mjx by up to 1")
     if elsewhere:
         _warn_of_another_sample(f"{elsewhere}: rounding differs, by up to 1e-6 relative per operation, if nothing else does")
 
