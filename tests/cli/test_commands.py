@@ -277,7 +277,7 @@ def test_help_explains_every_flag(run):
         assert re.search(rf"{flag}\b", out)
 
 
-@pytest.mark.parametrize(("kind", "code"), [(signal.SIGTERM, 143), pytest.param(signal.SIGINT, 130, marks=pytest.mark.slow)])
+@pytest.mark.parametrize(("kind", "code"), [(signal.SIGTERM, 143), (signal.SIGINT, 130)])
 def test_a_signal_saves_a_checkpoint_and_ends_with_its_code(kind, code, tmp_path):
     argv = ["--total-steps", "100_000_000", "--run-dir", str(tmp_path / "run"), *TINY]
     process = subprocess.Popen([sys.executable, "experiments/train.py", *argv], cwd=ROOT, stdout=subprocess.PIPE, text=True)

@@ -81,7 +81,7 @@ OLD = {**os.environ, "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0", "LC_ALL": "C
     [
         (">/dev/full 2>/dev/full", {}),
         (">&- 2>&- <&-", {}),
-        pytest.param(">/dev/null", {"PYTHONIOENCODING": "ascii"}, marks=pytest.mark.slow),
+        (">/dev/null", {"PYTHONIOENCODING": "ascii"}),
     ],
 )
 def test_a_run_ends_well_whatever_becomes_of_its_output(shell, environment, tmp_path):
