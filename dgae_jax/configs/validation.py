@@ -34,7 +34,7 @@ WHOLE = {
 """Whole numbers: from, to, and why not more."""
 
 LAYERS, WIDTH = 32, 65_536
-"""Most hidden layers and units in one: XLA compiles each layer of every network by itself, for minutes from a hundred on."""
+"""Most hidden layers and units in one: XLA compiles each layer by itself, and a layer this wide fills a large device."""
 
 UNIT = ("gamma", "lam", "policy.learning_rate_end", "critic.learning_rate_end")
 """Numbers from 0 to 1."""
