@@ -2,6 +2,8 @@
 
 import ast
 import re
+import subprocess
+import sys
 import tomllib
 
 import pytest
@@ -32,3 +34,9 @@ def test_a_module_has_a_docstring_and_at_most_250_lines(path):
 def test_no_test_imports_another_test_file():
     for path in TESTS:
         assert not re.search(r"^(from|import) tests\S*\.test_|^from tests\S* import test_", path.read_text(), re.MULTILINE), path
+
+
+@pytest.mark.parametrize("module", ["envs.brax", "learn.normalizers", "run.api"])
+def test_importing_a_module_prints_nothing_where_warp_is_not_installed(module):
+    program = f"import sys; sys.modules['warp'] = None; import dgae_jax.{module}"
+    assert subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True).stdout == ""

@@ -6,12 +6,12 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-from brax.envs.base import Env
 
 import dgae_jax.configs.pytree  # noqa: F401
 from dgae_jax.configs.config import Config, ConfigError, CriticConfig, PolicyConfig, lookup
 from dgae_jax.configs.parts import COVARIANCES, CRITICS, DESCENT, OPTIMIZERS, RESIDUALS, TARGETS, UPDATES
 from dgae_jax.configs.validation import validate
+from dgae_jax.envs.base import Env
 from dgae_jax.envs.noise import Noisy
 from dgae_jax.envs.registry import make_env
 from dgae_jax.learn import diagnostics, iteration, parallel

@@ -10,9 +10,9 @@ from itertools import pairwise
 from typing import Any
 
 import jax
-from brax.envs.base import Env
 
 from dgae_jax.configs.config import Config, invalid
+from dgae_jax.envs.base import Env
 
 USUAL: dict[str, Any] = {
     "num_seeds": 1, "num_envs": 16, "horizon": 128, "policy.hidden": (64, 64), "critic.hidden": (64, 64), "critic.quantiles": 64,

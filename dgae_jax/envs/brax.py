@@ -7,11 +7,10 @@ trainers: `brax.envs.get_environment("dgae_hopper", physics="jax")`.
 import warnings
 from functools import partial
 
-import brax.envs
 import jax.numpy as jnp
-from brax.envs.base import Env, Wrapper
 from jaxtyping import Array, Float
 
+from dgae_jax.envs.base import Env, Wrapper, brax
 from dgae_jax.envs.registry import BRAX, TASKS, make_env
 from dgae_jax.physics.quiet import silenced
 

@@ -3,9 +3,9 @@
 from typing import Any
 
 import jax
-from brax.envs.base import Env, State, Wrapper
 from jaxtyping import Array
 
+from dgae_jax.envs.base import Env, State, Wrapper
 from dgae_jax.envs.task import Task
 
 

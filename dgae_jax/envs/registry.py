@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from dgae_jax.physics.registry import ENGINES
 
 if TYPE_CHECKING:
-    from brax.envs.base import Env
+    from dgae_jax.envs.base import Env
 
 BRAX = "brax:"
 """Before the name of an environment of Brax's own."""

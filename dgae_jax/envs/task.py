@@ -12,9 +12,9 @@ from typing import Any, ClassVar
 import jax
 import jax.numpy as jnp
 import mujoco
-from brax.envs.base import Env, State
 from jaxtyping import Array, ArrayLike, Bool, Float
 
+from dgae_jax.envs.base import Env, State
 from dgae_jax.physics.engine import Physics, PhysicsState, Reads
 from dgae_jax.physics.registry import make_physics
 

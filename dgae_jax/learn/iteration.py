@@ -4,9 +4,9 @@ from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
-from brax.envs.base import Env
 from jaxtyping import Array, ArrayLike, Bool, Key
 
+from dgae_jax.envs.base import Env
 from dgae_jax.learn import normalizers
 from dgae_jax.learn.diagnostics import Diagnose, nothing
 from dgae_jax.learn.rollout import Act, Episodes, rollout, start

@@ -5,8 +5,9 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-from brax.envs.base import Env
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
+
+from dgae_jax.envs.base import Env
 
 
 class Play(NamedTuple):

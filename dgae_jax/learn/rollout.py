@@ -5,9 +5,9 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-from brax.envs.base import Env
 from jaxtyping import Array, Bool, Float, Int, Key
 
+from dgae_jax.envs.base import Env
 from dgae_jax.learn.types import Transition
 
 Act = Callable[[Array, Array], tuple[Array, Array]]
