@@ -14,7 +14,7 @@ class RunOptions:
     run_dir: Path | None = None
     """Directory to write, new or empty; by default runs/ENV-ALGO-SEED-TIME [path]."""
     cache_dir: str = "~/.cache/dgae_jax"
-    """Where compiled programs are kept between runs (JAX keeps those of jax, not of native); none disables [path]."""
+    """Where compiled programs are kept between runs; none disables [path]."""
     checkpoint_every: int = 200_000
     """Samples of each run between checkpoints, which are evaluated too; one is always saved at the end [environment steps]."""
     keep_checkpoints: int = 3

@@ -1,4 +1,4 @@
-"""C MuJoCo behind a callback: batches of any shape, non-finite states, and its warnings."""
+"""C MuJoCo inside jitted programs: batches of any shape, non-finite states, and its warnings."""
 
 import logging
 from collections import Counter

@@ -14,7 +14,7 @@ from tests.runs import QUIET, SMALL, small
 
 @pytest.fixture(scope="session", autouse=True)
 def _compiled_once():
-    """Runs of the same configuration share their program, which JAX does not keep for `native`."""
+    """Runs of the same configuration share their program, so that each is traced once."""
     with pytest.MonkeyPatch.context() as patch:
         for make in (training.make_task, training.make_trainer):
             patch.setattr(training, make.__name__, cache(make))
