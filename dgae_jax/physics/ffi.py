@@ -136,4 +136,4 @@ def _arrays(buffers: _Buffers) -> list[np.ndarray]:
 def _view(address: int | None, dtype: int, shape: tuple[int, ...]) -> np.ndarray:
     number = np.dtype(_DTYPES[dtype])
     memory = (ctypes.c_char * (math.prod(shape) * number.itemsize)).from_address(address or 0)  # no elements, no address
-    return np.ndarray(shape, number, memory)
+    return np.ndarray(shape, number, memory)  # pyright: ignore[reportArgumentType, reportCallIssue]
