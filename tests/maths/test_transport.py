@@ -106,6 +106,25 @@ def test_quantile_huber_loss_by_hand():
     assert_allclose(dg.quantile_huber_loss(z, jnp.array([0.0])), 0.25 * 0.5)
 
 
+@pytest.mark.parametrize(("k", "j"), [(1, 1), (3, 40), (40, 3), (17, 16)])
+def test_quantile_huber_and_its_derivatives_are_those_of_all_residuals_laid_out(k, j, key):
+    z, y = 3 * jax.random.normal(key, (5, k)), 3 * jax.random.normal(jax.random.key(1), (2, 5, j))
+
+    def laid_out(z, y, kappa):
+        u = np.asarray(y)[..., None, :] - np.asarray(z)[..., :, None]
+        tau = ((np.arange(k) + 0.5) / k)[:, None]
+        weight = np.abs(tau - (u < 0))
+        loss = weight * np.where(np.abs(u) <= kappa, 0.5 * u**2, kappa * (np.abs(u) - 0.5 * kappa))
+        slope = weight * np.clip(u, -kappa, kappa)
+        return loss.mean(-1).sum(-1), -slope.mean(-1).sum(0), slope.sum(-2) / j
+
+    loss = jax.jit(lambda z, y: dg.quantile_huber_loss(z, y, kappa=0.7))
+    value, by_quantiles, by_target = laid_out(z, y, 0.7)
+    assert_allclose(loss(z, y), value, rtol=1e-5)
+    assert_allclose(jax.grad(lambda z, y: loss(z, y).sum(), argnums=0)(z, y), by_quantiles, rtol=1e-5, atol=1e-6)
+    assert_allclose(jax.grad(lambda z, y: loss(z, y).sum(), argnums=1)(z, y), by_target, rtol=1e-5, atol=1e-6)
+
+
 def test_quantile_huber_of_one_quantile_is_half_the_huber_loss(key):
     z, y = jax.random.normal(key, (2, 6, 1))
     assert_allclose(dg.quantile_huber_loss(z, y, kappa=0.3), 0.5 * huber(y - z, 0.3)[:, 0], rtol=1e-6)
