@@ -89,7 +89,7 @@ def _newton(p: Problem, s: _Iterate) -> _Iterate:
     step = -spatial.solve(hessian, s.g + sum(weighted[:, c] * s.r[c] for c in rows))
     moves, push = spatial.combine(p.jacobian, step), spatial.combine(p.mass, step)
     slope, curvature = spatial.dot(step, s.g), spatial.dot(step, push)
-    length = _line_search(slope, curvature, p.stiffness, s.r, moves)
+    length = _line_search(slope, curvature, p.stiffness, s.r, moves, s.done)
     a, r, g = s.a + length * step, s.r + length * moves, s.g + length * push
     stands = jnp.all((r < 0) == (s.r < 0), 0) & (jnp.abs(length - 1) < 1e-3)
     tiny = jnp.max(jnp.abs(length * step), 0) <= 4 * jnp.finfo(a.dtype).eps * jnp.max(jnp.abs(a), 0)
@@ -97,8 +97,11 @@ def _newton(p: Problem, s: _Iterate) -> _Iterate:
     return jax.tree.map(lambda old, new: jnp.where(s.done, old, new), s, new)
 
 
-def _line_search(slope0: Array, curvature: Array, stiffness: Array, r: Array, moves: Array) -> Array:
-    """The length that minimises the cost along a step: safeguarded Newton on its piecewise linear derivative."""
+def _line_search(slope0: Array, curvature: Array, stiffness: Array, r: Array, moves: Array, done: Array) -> Array:
+    """The length that minimises the cost along a step: safeguarded Newton on its piecewise linear derivative.
+
+    Nobody waits for worlds that are `done`, whose step is not taken.
+    """
     linear, quadratic = stiffness * moves * r, stiffness * moves * moves
 
     def refine(carry):
@@ -115,7 +118,7 @@ def _line_search(slope0: Array, curvature: Array, stiffness: Array, r: Array, mo
 
     def moving(carry):
         length, _, _, before, n = carry
-        return (n < LINE_SEARCH) & (jnp.abs(length - before) > 1e-6 * length).any()
+        return (n < LINE_SEARCH) & ((jnp.abs(length - before) > 1e-6 * length) & ~done).any()
 
     one = jnp.ones_like(slope0)
     length = jax.lax.while_loop(moving, refine, (one, 0 * one, jnp.inf * one, 0 * one, 0))[0]
