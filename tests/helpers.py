@@ -35,9 +35,9 @@ def small(algo, **changes):
     return dataclasses.replace(SMALL, algo=algo, policy=policy, critic=critic, **changes)
 
 
-TINY = ["--num-envs", "4", "--horizon", "16", "--policy.minibatches", "4", "--critic.minibatches", "4", "--policy.hidden", "8",
-        "--critic.hidden", "8", "--cache-dir", str(Path(tempfile.gettempdir()) / "dgae_jax_tests")]  # fmt: skip
-"""Flags of a small run, on the engine whose compiled programs are kept between processes."""
+TINY = ["--physics", "native", "--num-envs", "4", "--horizon", "16", "--policy.minibatches", "4", "--critic.minibatches", "4",
+        "--policy.hidden", "8", "--critic.hidden", "8", "--cache-dir", str(Path(tempfile.gettempdir()) / "dgae_jax_tests")]  # fmt: skip
+"""Flags of a small run; processes share its compiled programs."""
 
 
 def command(name):

@@ -41,8 +41,6 @@ def trained(tmp_path_factory):
         "3",
         "--checkpoint-every",
         "300",
-        "--physics",
-        "native",
         *TINY,
     ]
     done = subprocess.run(

@@ -49,9 +49,9 @@ def test_the_fisher_product_is_the_hessian_of_the_divergence():
     params, batch = example()
     flat, unravel = ravel_pytree(params)
     here = POLICY.apply(params, batch.obs)
-    hessian = jax.hessian(lambda x: gaussian.kl(here, POLICY.apply(unravel(x), batch.obs)).mean())(flat)
+    hessian = jax.jit(jax.hessian(lambda x: gaussian.kl(here, POLICY.apply(unravel(x), batch.obs)).mean()))(flat)
     product = fisher_product(POLICY, params, batch.obs, 0.0)
-    columns = jax.vmap(lambda v: ravel_pytree(product(unravel(v)))[0])(jnp.eye(len(flat)))
+    columns = jax.jit(jax.vmap(lambda v: ravel_pytree(product(unravel(v)))[0]))(jnp.eye(len(flat)))
     assert_allclose(columns, hessian, atol=1e-5)
 
 

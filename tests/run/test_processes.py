@@ -19,7 +19,7 @@ def start(run_dir, *more):
     if (run_dir / "config.json").exists():
         argv = ["--resume", str(run_dir)]
     else:
-        argv = ["--run-dir", str(run_dir), "--total-steps", str(40 * 64), "--physics", "native", *TINY]
+        argv = ["--run-dir", str(run_dir), "--total-steps", str(40 * 64), *TINY]
     argv += ["--checkpoint-every", str(5 * 64), "--episodes", "1", *more]
     return subprocess.Popen([sys.executable, "experiments/train.py", *argv], cwd=ROOT, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
 
@@ -85,8 +85,6 @@ def test_a_signal_while_it_compiles_ends_it_at_once(kind, code, tmp_path):
         str(tmp_path / "run"),
         "--total-steps",
         "640",
-        "--physics",
-        "native",
         *TINY,
         "--policy.hidden",
         *layers,
