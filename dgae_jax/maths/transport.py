@@ -49,14 +49,10 @@ def wasserstein(u: Float[Array, "*#batch K"], v: Float[Array, "*#batch K"], p: f
     return (jnp.abs(jnp.sort(u) - jnp.sort(v)) ** p).mean(-1) ** (1 / p)
 
 
-def huber(u: Float[Array, "*shape"], kappa: ArrayLike) -> Float[Array, "*shape"]:
-    """L_κ(u) = ½u² where |u| ≤ κ, κ(|u| − ½κ) beyond (below Eq. quantile_huber_loss).
-
-    Differentiable once: the second derivative is 0.
-    """
-    # L'_κ(u) is the clipped u itself, so it may be held constant: exact, and three times faster than through the clip
-    inside = jax.lax.stop_gradient(jnp.clip(u, jnp.negative(kappa), kappa))
-    return inside * (u - 0.5 * inside)
+def huber(u: Float[Array, "*shape"], kappa: ArrayLike) -> tuple[Float[Array, "*shape"], Float[Array, "*shape"]]:
+    """L_κ(u) = ½u² where |u| ≤ κ, κ(|u| − ½κ) beyond (below Eq. quantile_huber_loss), and its derivative, the clipped u."""
+    slope = jnp.clip(u, jnp.negative(kappa), kappa)
+    return slope * (u - 0.5 * slope), slope
 
 
 def quantile_huber_loss(
@@ -80,17 +76,16 @@ def _quantile_huber(quantiles: Array, target: Array, kappa: Array) -> Array:
 def _loss_and_slopes(quantiles: Array, target: Array, kappa: Array) -> tuple[Array, tuple[Array, Array]]:
     """The loss and its derivatives by quantiles and targets, in one pass over the targets.
 
-    The K × J residuals of a sample are never laid out, which would cost several times more than computing them. The derivative of
-    L_κ(u) is the clipped u.
+    The K × J residuals of a sample are never laid out, which would cost several times more than computing them.
     """
     tau = quantile_midpoints(quantiles.shape[-1])
 
     def add(sums: tuple[Array, Array], target: Array):
         loss, slope = sums
         u = target[..., None] - quantiles
-        inside = jnp.clip(u, -kappa, kappa)
-        pull = jnp.where(u < 0, 1 - tau, tau) * inside
-        return (loss + pull * (u - 0.5 * inside), slope - pull), pull.sum(-1)
+        weight = jnp.where(u < 0, 1 - tau, tau)
+        distance, pull = (weight * x for x in huber(u, kappa))
+        return (loss + distance, slope - pull), pull.sum(-1)
 
     nothing = jnp.zeros_like(quantiles)
     (loss, slope), pulls = jax.lax.scan(add, (nothing, nothing), jnp.moveaxis(target, -1, 0), unroll=_UNROLL)
