@@ -92,5 +92,5 @@ def test_a_problem_that_is_not_finite_ends_and_does_not_disturb_the_others():
 def test_the_line_search_is_exact_on_a_kink_by_hand():
     # cost ½(1 - t)²·2 from the step, plus ½·8·min(t - ½ ... )²: one row, r = 1, moving by -2 per unit step, D = 2
     # derivative: -1 + t (step), + 2·(1 - 2t)·(-2) once 1 - 2t < 0: -1 + t - 4 + 8t = 0 at t = 5/9
-    length = newton._line_search(*map(jnp.array, ([-1.0], [1.0], [[2.0]], [[1.0]], [[-2.0]])))
+    length = newton._line_search(*map(jnp.array, ([-1.0], [1.0], [[2.0]], [[1.0]], [[-2.0]], [False])))
     assert_allclose(length, [5 / 9], rtol=1e-6)
