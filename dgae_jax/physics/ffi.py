@@ -1,7 +1,7 @@
 """A Python function as a custom call of XLA: the CPU calls it by name, with views of its own buffers.
 
 `jax.pure_callback` writes the address of the function into the program, so that JAX cannot keep the program in its compilation cache,
-and takes every array through JAX. The structures are those of `xla/ffi/api/c_api.h`, a stable binary interface.
+and takes every array through JAX. The structures are those of `xla/ffi/api/c_api.h`, whose versions XLA supports for a year at least.
 """
 
 import ctypes
@@ -12,7 +12,7 @@ from collections.abc import Callable, Sequence
 import jax
 import numpy as np
 
-_MAJOR, _MINOR = 0, 1  # the first version that has all that is used here
+_MAJOR, _MINOR = 0, 1  # of the interface; JAX 0.10 and 0.12 accept it
 _DTYPES = {11: np.float32, 12: np.float64}
 _INTERNAL = 13
 """XLA's error code of a defect in the called function."""
@@ -21,10 +21,14 @@ Function = Callable[[Sequence[np.ndarray], Sequence[np.ndarray]], None]
 """Reads the arrays of its first argument and fills those of its second."""
 
 
-class _Buffer(ctypes.Structure):
+class _Struct(ctypes.Structure):
+    """What nearly all of them begin with; the names below are those of the header."""
+
+    _fields_ = (("struct_size", ctypes.c_size_t), ("extension", ctypes.c_void_p))
+
+
+class _Buffer(_Struct):
     _fields_ = (
-        ("struct_size", ctypes.c_size_t),
-        ("extension", ctypes.c_void_p),
         ("dtype", ctypes.c_int),
         ("data", ctypes.c_void_p),
         ("rank", ctypes.c_int64),
@@ -32,23 +36,12 @@ class _Buffer(ctypes.Structure):
     )
 
 
-class _Buffers(ctypes.Structure):
-    _fields_ = (
-        ("struct_size", ctypes.c_size_t),
-        ("extension", ctypes.c_void_p),
-        ("size", ctypes.c_int64),
-        ("types", ctypes.c_void_p),
-        ("buffers", ctypes.POINTER(ctypes.POINTER(_Buffer))),
-    )
+class _Buffers(_Struct):
+    _fields_ = (("size", ctypes.c_int64), ("types", ctypes.c_void_p), ("buffers", ctypes.POINTER(ctypes.POINTER(_Buffer))))
 
 
-class _Version(ctypes.Structure):
-    _fields_ = (
-        ("struct_size", ctypes.c_size_t),
-        ("extension", ctypes.c_void_p),
-        ("major", ctypes.c_int),
-        ("minor", ctypes.c_int),
-    )
+class _Version(_Struct):
+    _fields_ = (("major", ctypes.c_int), ("minor", ctypes.c_int))
 
 
 class _Metadata(ctypes.Structure):
@@ -64,32 +57,20 @@ class _MetadataRequest(ctypes.Structure):
     )
 
 
-class _ErrorArguments(ctypes.Structure):
+class _ErrorArguments(_Struct):
+    _fields_ = (("message", ctypes.c_char_p), ("code", ctypes.c_int))
+
+
+class _Api(_Struct):
     _fields_ = (
-        ("struct_size", ctypes.c_size_t),
-        ("extension", ctypes.c_void_p),
-        ("message", ctypes.c_char_p),
-        ("code", ctypes.c_int),
-    )
-
-
-_ErrorCreate = ctypes.CFUNCTYPE(ctypes.c_void_p, ctypes.POINTER(_ErrorArguments))
-
-
-class _Api(ctypes.Structure):
-    _fields_ = (
-        ("struct_size", ctypes.c_size_t),
-        ("extension", ctypes.c_void_p),
         ("version", _Version),
         ("internal", ctypes.c_void_p),
-        ("error_create", _ErrorCreate),
+        ("error_create", ctypes.CFUNCTYPE(ctypes.c_void_p, ctypes.POINTER(_ErrorArguments))),
     )
 
 
-class _CallFrame(ctypes.Structure):
+class _CallFrame(_Struct):
     _fields_ = (
-        ("struct_size", ctypes.c_size_t),
-        ("metadata_request", ctypes.POINTER(_MetadataRequest)),
         ("api", ctypes.POINTER(_Api)),
         ("context", ctypes.c_void_p),
         ("stage", ctypes.c_int),
@@ -114,8 +95,8 @@ def register(name: str, function: Function) -> None:
 
 def _handle(function: Function, pointer) -> int | None:
     frame = pointer.contents
-    if frame.metadata_request:  # asked once, when it is registered
-        metadata = frame.metadata_request.contents.metadata.contents
+    if frame.extension:  # XLA asks for the version and no more
+        metadata = ctypes.cast(frame.extension, ctypes.POINTER(_MetadataRequest)).contents.metadata.contents
         metadata.version.major, metadata.version.minor, metadata.traits = _MAJOR, _MINOR, 0
         return None
     try:

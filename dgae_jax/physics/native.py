@@ -8,6 +8,7 @@ import math
 import os
 import threading
 from collections.abc import Sequence
+from functools import partial
 
 import jax
 import mujoco
@@ -46,17 +47,15 @@ class _Host:
             warned = _warnings(batch)
             batch.step(nstep=self.frame_skip)
             quiet.count(_warnings(batch) - warned)
-            values = [*map(batch.bind, _FIELDS), batch.bind("xpos")[:, self.bodies], *([self._forces(batch)] if self.reads.forces else ())]
-            for array, value in zip(after, values, strict=False):  # without forces, their array has no elements
+            forces = self._forces(batch) if self.reads.forces else np.empty((count, 0, 6))
+            for array, value in zip(after, (*map(batch.bind, _FIELDS), batch.bind("xpos")[:, self.bodies], forces), strict=True):
                 array[:] = value.reshape(array.shape)
 
-    def returned(self, *before) -> tuple[np.ndarray, ...]:
-        """The same for `jax.pure_callback`, where JAX's device is another than the CPU."""
-        before = [np.asarray(x) for x in before]
-        lead, dtype, model = before[0].shape[:-1], before[0].dtype, self.model
-        shapes = (model.nq,), (model.nv,), (model.nv,), (len(self.bodies), 3), (model.nbody if self.reads.forces else 0, 6)
-        after = tuple(np.empty((*lead, *shape), dtype) for shape in shapes)
-        self.step(before, after)
+    def returned(self, like: Sequence[jax.ShapeDtypeStruct], *before) -> tuple[np.ndarray, ...]:
+        """The same for `jax.pure_callback`: `like` is the `PhysicsState` of one of the worlds."""
+        lead = before[0].shape[: before[0].ndim - len(like[0].shape)]
+        after = tuple(np.empty((*lead, *x.shape), x.dtype) for x in like)
+        self.step([np.asarray(x) for x in before], after)
         return after
 
     def _batch(self, count: int) -> Batch:
@@ -98,8 +97,8 @@ def native(spec: mujoco.MjSpec, frame_skip: int, reads: Reads) -> Physics:
         like = tuple(jax.ShapeDtypeStruct(x.shape, x.dtype) for x in state)
         on_cpu = jax.ffi.ffi_call(name, like, vmap_method="broadcast_all")
 
-        def elsewhere(*before):
-            return jax.pure_callback(host.returned, like, *before, vmap_method="broadcast_all")
+        def elsewhere(*before):  # JAX's device is not the CPU
+            return jax.pure_callback(partial(host.returned, like), like, *before, vmap_method="broadcast_all")
 
         return PhysicsState(*jax.lax.platform_dependent(*state[:3], ctrl, cpu=on_cpu, default=elsewhere))
 
@@ -110,4 +109,4 @@ def _digest(model: mujoco.MjModel, frame_skip: int, reads: Reads) -> str:
     """The same in every process: programs that are kept find their step by it."""
     binary = np.zeros(mujoco.mj_sizeModel(model), np.uint8)
     mujoco.mj_saveModel(model, None, binary)
-    return hashlib.sha256(repr((binary.tobytes(), frame_skip, reads)).encode()).hexdigest()[:32]
+    return hashlib.sha256(binary.tobytes() + repr((frame_skip, reads)).encode()).hexdigest()[:32]

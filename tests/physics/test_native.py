@@ -12,7 +12,7 @@ from numpy.testing import assert_array_equal
 from dgae_jax.envs.task import load_spec
 from dgae_jax.physics import quiet
 from dgae_jax.physics.engine import Reads
-from dgae_jax.physics.native import native
+from dgae_jax.physics.native import _Host, native
 from tests.parity import reference, states
 
 
@@ -24,6 +24,19 @@ def test_the_same_bits_through_nested_vmaps_and_alone():
     alone = jax.jit(physics.step)(jax.tree.map(lambda x: x[2, 1], state), ctrl[2, 1])
     assert_array_equal(nested.qpos.reshape(12, -1), want.qpos[:12].astype("float32"))
     assert_array_equal(alone.qvel, nested.qvel[2, 1])
+
+
+@pytest.mark.parametrize("forces", [False, True])
+def test_where_the_device_is_not_the_cpu_a_callback_returns_the_same_bits(forces):
+    reads = Reads(("torso",), forces)
+    physics = native(load_spec("ant.xml"), 5, reads)
+    qpos, qvel, _, ctrl = (jnp.asarray(x[:6]).reshape(2, 3, -1) for x in states("ant"))
+    state = physics.at_pose(qpos, qvel)
+    after = jax.jit(jax.vmap(jax.vmap(physics.step)))(state, ctrl)
+    like = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape[2:], x.dtype), tuple(state))
+    for ours, theirs in zip(after, _Host(physics.model, 5, reads).returned(like, *state[:3], ctrl), strict=True):
+        assert_array_equal(ours, theirs)
+    assert after.cfrc_ext.size == (2 * 3 * 14 * 6 if forces else 0)
 
 
 def test_a_non_finite_state_can_be_seen():
