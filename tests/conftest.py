@@ -14,6 +14,16 @@ import pytest  # noqa: E402
 jax.config.update("jax_compilation_cache_dir", os.path.join(tempfile.gettempdir(), "dgae_jax_tests"))  # noqa: PTH118
 
 
+OPTIMIZATIONS = "JAX_DISABLE_MOST_OPTIMIZATIONS"
+
+
+def pytest_configure(config):
+    """The small programs of the default suite cost more to compile than to run; the slow tests train, and compile as users do."""
+    if config.option.markexpr == "not slow" and OPTIMIZATIONS not in os.environ:
+        os.environ[OPTIMIZATIONS] = "1"  # also in the processes that tests start
+        jax.config.update(OPTIMIZATIONS.lower(), True)
+
+
 @pytest.fixture(scope="session", autouse=True)
 def _hang_ups_are_heard():
     """Also where the tests run under `nohup`, which processes inherit."""

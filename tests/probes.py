@@ -29,20 +29,19 @@ class Counter(Env):
 
 
 class Fragile(Counter):
-    """A counter in which, at its third step, what `where` names turns to `value` if the fraction it started from is below ½."""
+    """A counter of which one part turns to `value` at the third step, if the fraction it started from is below ½.
 
-    def __init__(self, where: str, value: float):
+    Of several parts of the state, that fraction chooses one.
+    """
+
+    def __init__(self, value: float, *parts: str):
         super().__init__()
-        self.where, self.value = where, value
+        self.value, self.parts = value, parts
 
     def step(self, state, action):
         after = super().step(state, action)
-        breaks = (after.obs[0] == 3) & (after.obs[1] < 0.5)
-        if self.where == "state":
-            return after.replace(pipeline_state=jnp.where(breaks, self.value, after.pipeline_state))
-        if self.where == "reward":
-            return after.replace(reward=jnp.where(breaks, self.value, after.reward))
-        return after.replace(obs=jnp.where(breaks, self.value, after.obs))
+        chosen = jnp.where(after.obs[0] == 3, jnp.floor(2 * len(self.parts) * after.obs[1]), -1)
+        return after.replace(**{part: jnp.where(chosen == i, self.value, getattr(after, part)) for i, part in enumerate(self.parts)})
 
 
 class Target(Env):

@@ -73,9 +73,9 @@ def test_actions_are_clipped_before_they_act_and_recorded_as_sampled(key):
 
 
 @pytest.mark.parametrize("value", [jnp.nan, jnp.inf])
-@pytest.mark.parametrize("where", ["state", "reward", "observation"])
-def test_a_world_that_turns_non_finite_ends_terminated_without_reward_and_starts_afresh(where, value, key):
-    episodes, step = run(Fragile(where, value), key, worlds=16, horizon=4, episode_length=100)
+@pytest.mark.parametrize("part", ["pipeline_state", "reward", "obs"])
+def test_a_world_that_turns_non_finite_ends_terminated_without_reward_and_starts_afresh(part, value, key):
+    episodes, step = run(Fragile(value, part), key, worlds=16, horizon=4, episode_length=100)
     broken = np.asarray(step.obs[0, :, 1] < 0.5)
     assert 0 < broken.sum() < 16
     assert_array_equal(step.terminated[2], broken)
@@ -109,7 +109,7 @@ def test_a_state_broken_from_outside_reaches_no_step(key):
 
 
 def test_the_incident_is_the_state_before_and_the_action(key):
-    episodes, _ = run(Fragile("reward", jnp.nan), key, worlds=16, horizon=3, episode_length=100)
+    episodes, _ = run(Fragile(jnp.nan, "reward"), key, worlds=16, horizon=3, episode_length=100)
     state, action = episodes.incident
     assert_array_equal(action, 3.0)
     assert float(state) == 0

@@ -149,7 +149,7 @@ def step_of_sb3_contrib(params, batch, radius, damping):
         return (new.log_std - old.log_std + (p + (old.mean - new.mean) ** 2) / (2 * q) - 0.5).mean()
 
     gradient = jax.grad(lambda x: surrogate(POLICY)(unravel(x), batch)[0])(flat)
-    damped = np.asarray(jax.hessian(divergence)(flat) + damping * jnp.eye(len(flat)), np.float64)
+    damped = np.asarray(jax.jit(jax.hessian(divergence))(flat) + damping * jnp.eye(len(flat)), np.float64)
     direction = scipy.linalg.solve(damped, -np.asarray(gradient, np.float64), assume_a="pos")
     return direction * np.sqrt(2 * radius / (direction @ damped @ direction))
 
