@@ -33,3 +33,9 @@ def _hang_ups_are_heard():
 @pytest.fixture
 def key():
     return jax.random.key(0)
+
+
+@pytest.fixture
+def elsewhere(monkeypatch):
+    """What a test traces is the program for a device that is not a CPU, though a CPU runs it."""
+    monkeypatch.setattr(jax.lax, "platform_dependent", lambda *args, default, **_: default(*args))

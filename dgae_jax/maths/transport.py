@@ -74,23 +74,33 @@ def _quantile_huber(quantiles: Array, target: Array, kappa: Array) -> Array:
 
 
 def _loss_and_slopes(quantiles: Array, target: Array, kappa: Array) -> tuple[Array, tuple[Array, Array]]:
-    """The loss and its derivatives by quantiles and targets, in one pass over the targets.
+    """The loss and its derivatives by quantiles and targets.
 
-    The K × J residuals of a sample are never laid out, which would cost several times more than computing them.
+    On a CPU one target after the other: laying out the K × J residuals of a sample would cost several times more than computing
+    them. An accelerator computes them all at once, because there every turn of a loop costs a launch.
     """
     tau = quantile_midpoints(quantiles.shape[-1])
-
-    def add(sums: tuple[Array, Array], target: Array):
-        loss, slope = sums
-        u = target[..., None] - quantiles
-        weight = jnp.where(u < 0, 1 - tau, tau)
-        distance, pull = (weight * x for x in huber(u, kappa))
-        return (loss + distance, slope - pull), pull.sum(-1)
-
-    nothing = jnp.zeros_like(quantiles)
-    (loss, slope), pulls = jax.lax.scan(add, (nothing, nothing), jnp.moveaxis(target, -1, 0), unroll=_UNROLL)
     count = target.shape[-1]
-    return loss.sum(-1) / count, (slope / count, jnp.moveaxis(pulls, 0, -1) / count)
+
+    def weighed(u: Array, tau: Array) -> list[Array]:
+        weight = jnp.where(u < 0, 1 - tau, tau)
+        return [weight * x for x in huber(u, kappa)]
+
+    def in_turn(quantiles: Array, target: Array) -> tuple[Array, Array, Array]:
+        def add(sums: tuple[Array, Array], target: Array):
+            distance, pull = weighed(target[..., None] - quantiles, tau)
+            return (sums[0] + distance, sums[1] - pull), pull.sum(-1)
+
+        nothing = jnp.zeros_like(quantiles)
+        (loss, slope), pulls = jax.lax.scan(add, (nothing, nothing), jnp.moveaxis(target, -1, 0), unroll=_UNROLL)
+        return loss.sum(-1), slope, jnp.moveaxis(pulls, 0, -1)
+
+    def at_once(quantiles: Array, target: Array) -> tuple[Array, Array, Array]:
+        distance, pull = weighed(target[..., None, :] - quantiles[..., None], tau[:, None])
+        return distance.sum((-2, -1)), -pull.sum(-1), pull.sum(-2)
+
+    loss, slope, pulls = jax.lax.platform_dependent(quantiles, target, cpu=in_turn, default=at_once)
+    return loss / count, (slope / count, pulls / count)
 
 
 def _backward(slopes: tuple[Array, Array], cotangent: Array) -> tuple[Array, Array, Array]:

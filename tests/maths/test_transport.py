@@ -137,3 +137,16 @@ def test_quantile_huber_is_minimised_by_the_empirical_quantile(i, key):
     losses = jax.vmap(lambda x: dg.quantile_huber_loss(jnp.zeros(4).at[i].set(x), samples, kappa=1e-3))(samples)
     expected = np.quantile(np.asarray(samples), float(dg.quantile_midpoints(4)[i]), method="inverted_cdf")
     assert_allclose(samples[losses.argmin()], expected)
+
+
+def test_quantile_huber_and_its_derivatives_on_an_accelerator_are_those_on_a_cpu(elsewhere):
+    quantiles, target = jnp.asarray(np.random.default_rng(0).normal(size=(2, 6, 5)), jnp.float32)
+
+    def both():
+        return jax.value_and_grad(lambda q, t: dg.quantile_huber_loss(q, t, kappa=0.7).sum(), argnums=(0, 1))(quantiles, target)
+
+    got = both()
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(jax.lax, "platform_dependent", lambda *args, cpu, **_: cpu(*args))
+        want = both()
+    jax.tree.map(lambda a, b: assert_allclose(a, b, atol=1e-6), got, want)

@@ -123,8 +123,16 @@ def frames_of(tree: Tree, qpos: Float[Array, "Q W"]) -> Float[Array, "F 3 4 W"]:
         pose = jnp.concatenate([pose, constant(np.eye(4)[3:], qpos.dtype) + 0 * pose[:1]])
         return frames.at[number].set(compose(frames[parent], pose)), None
 
+    def in_a_loop(frames, local):
+        return jax.lax.scan(hang, frames, (jnp.arange(len(joints)) + 1, jnp.asarray(tree.parents), local))[0]
+
+    def written_out(frames, local):  # an accelerator pays a launch for each turn of a loop
+        for joint in range(len(joints)):
+            frames, _ = hang(frames, (joint + 1, int(tree.parents[joint]), local[joint]))
+        return frames
+
     frames = jnp.zeros((len(joints) + 1, *root.shape), qpos.dtype).at[0].set(root)
-    return jax.lax.scan(hang, frames, (jnp.arange(len(joints)) + 1, jnp.asarray(tree.parents), local))[0]
+    return jax.lax.platform_dependent(frames, local, cpu=in_a_loop, default=written_out)
 
 
 def smooth(tree: Tree, qpos: Float[Array, "Q W"], qvel: Float[Array, "V W"], ctrl: Float[Array, "U W"]) -> Smooth:

@@ -80,8 +80,6 @@ def _in_blocks(advance):
     def blocks(state: PhysicsState, ctrl: Array) -> PhysicsState:
         worlds = ctrl.shape[-1]
         count = -(-worlds // _BLOCK)
-        if jax.default_backend() != "cpu" or count == 1:
-            return advance(state, ctrl)
         size = -(-worlds // count)
 
         def split(x):
@@ -91,7 +89,12 @@ def _in_blocks(advance):
         out = jax.lax.map(lambda block: advance(*block), jax.tree.map(split, (state, ctrl)))
         return jax.tree.map(lambda x: jnp.moveaxis(x, 0, -2).reshape(*x.shape[1:-1], count * size)[..., :worlds], out)
 
-    return blocks
+    def whole_or_blocks(state: PhysicsState, ctrl: Array) -> PhysicsState:
+        if ctrl.shape[-1] <= _BLOCK:
+            return advance(state, ctrl)
+        return jax.lax.platform_dependent(state, ctrl, cpu=blocks, default=advance)
+
+    return whole_or_blocks
 
 
 def _integrate(qpos: Array, move: Array, free: bool) -> Array:

@@ -1,0 +1,154 @@
+"""How many turns of loops follow one another in an environment step and in an update.
+
+    python benchmarks/turns.py
+
+On an accelerator a turn costs the launch of its kernels, and one whose loop goes on for as long as its data say so
+(a `while`) a round trip to the host besides. The programs are those for accelerators, run on this machine: turns are counted
+by carrying a counter through every loop of the traced program. Worlds begin at random poses and act at random.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+import dgae_jax as dg
+from dgae_jax.cli.arguments import parse
+from dgae_jax.configs.config import resolve
+from dgae_jax.envs.registry import TASKS
+from dgae_jax.learn.types import Batch, Fit
+
+CALLS = {"jit": "jaxpr", "pjit": "jaxpr", "checkpoint": "jaxpr", "custom_vmap_call": "call", "closed_call": "call_jaxpr",
+         "custom_jvp_call": "call_jaxpr", "custom_vjp_call": "call_jaxpr"}  # fmt: skip
+"""Primitives that only call a program, and the parameter that holds it."""
+
+
+@dataclass(frozen=True)
+class Arguments:
+    """What to count."""
+
+    worlds: int = 2048
+    """Worlds stepped side by side."""
+    steps: int = 10
+    """Environment steps, of which the mean is printed [steps]."""
+
+
+def counted(f: Callable) -> Callable:
+    """`counted(f)(*args) -> (f(*args), turns of loops of known length, turns of other loops)`, as an accelerator would run it."""
+
+    def count(*args: Any) -> tuple[Any, jax.Array, jax.Array]:
+        program, shape = jax.make_jaxpr(f, return_shape=True)(*args)
+        out, (known, other) = _run(program, jax.tree.leaves(args))
+        return jax.tree.unflatten(jax.tree.structure(shape), out), known, other
+
+    return jax.jit(count)
+
+
+def _run(program: Any, args: list) -> tuple[list, tuple[jax.Array, jax.Array]]:
+    """The program's outputs and its turns."""
+    jaxpr, consts = (program.jaxpr, program.consts) if hasattr(program, "consts") else (program, [])
+    values = dict(zip([*jaxpr.constvars, *jaxpr.invars], [*consts, *args], strict=True))
+    turns = jnp.int32(0), jnp.int32(0)
+    for eqn in jaxpr.eqns:
+        given = [x.val if hasattr(x, "val") else values[x] for x in eqn.invars]
+        out, more = _evaluate(eqn, given)
+        values.update(zip(eqn.outvars, out, strict=True))
+        turns = _add(turns, more)
+    return [x.val if hasattr(x, "val") else values[x] for x in jaxpr.outvars], turns
+
+
+def _evaluate(eqn: Any, args: list) -> tuple[list, tuple]:
+    """One operation's outputs, and the turns of its loops."""
+    name, how, none = eqn.primitive.name, eqn.params, (jnp.int32(0), jnp.int32(0))
+    if name == "platform_index":
+        return [how["platforms"].index(None)], none  # the branch for all but the CPU
+    if name == "custom_linear_solve":  # conjugate gradient
+        lengths = how["const_lengths"]
+        before = lengths.matvec + lengths.vecmat
+        return _run(how["jaxprs"].solve, args[before : before + lengths.solve] + args[sum(lengths) :])
+    if name in CALLS:
+        return _run(how[CALLS[name]], args)
+    if name == "cond":
+        return jax.lax.switch(args[0], [lambda *x, b=b: _run(b, [*x]) for b in how["branches"]], *args[1:])
+    if name == "scan":
+        fixed, carry, xs = _split(args, how["num_consts"], how["num_carry"])
+
+        def turn(state, x):
+            out, more = _run(how["jaxpr"], [*fixed, *state[0], *x])
+            return (out[: len(carry)], _add(state[1], more, (1, 0))), out[len(carry) :]
+
+        (carry, turns), ys = jax.lax.scan(turn, (carry, none), xs, length=how["length"], reverse=how["reverse"])
+        skipped = how["length"] - -(-how["length"] // how["unroll"])  # turns written out in others
+        return [*carry, *ys], (turns[0] - skipped, turns[1])
+    if name == "while":
+        asked, fixed, carry = _split(args, how["cond_nconsts"], how["body_nconsts"])
+
+        def repeat(state):
+            out, more = _run(how["body_jaxpr"], [*fixed, *state[0]])
+            return out, _add(state[1], more, (0, 1))
+
+        return jax.lax.while_loop(lambda s: _run(how["cond_jaxpr"], [*asked, *s[0]])[0][0], repeat, (carry, none))
+    out = eqn.primitive.bind(*args, **how)
+    return out if eqn.primitive.multiple_results else [out], none
+
+
+def _split(items: list, *sizes: int) -> tuple[list, ...]:
+    """The first so many, the next so many, the rest."""
+    a, b = sizes
+    return items[:a], items[a : a + b], items[a + b :]
+
+
+def _add(*counts: tuple) -> tuple[jax.Array, jax.Array]:
+    return tuple(jnp.int32(sum(column)) for column in zip(*counts, strict=True))  # pyright: ignore[reportReturnType]
+
+
+def of_step(name: str, worlds: int, steps: int) -> list[float]:
+    """Mean turns of one environment step of all worlds."""
+    env: Any = dg.make_env(name, physics="jax")
+    low, high = env.action_range
+    step, key, total = counted(jax.vmap(env.step)), jax.random.key(0), jnp.zeros(2)
+    state = jax.jit(jax.vmap(env.reset))(jax.random.split(key, worlds))
+    for k in jax.random.split(key, steps):
+        action = jax.random.uniform(k, (worlds, env.action_size), minval=low, maxval=high)
+        state, *turns = step(state, action)
+        total += jnp.array(turns)
+    return [float(x) / steps for x in total]
+
+
+def of_update(algo: str) -> list[list[int]]:
+    """Turns of the policy's update and of the critic's fit, with the tuned preset of Hopper."""
+    config = resolve(dg.preset("tuned", algo, "hopper"))
+    env = dg.make_env("hopper", physics="jax")
+    algorithm = dg.make_algorithm(algo, env, config)
+    size, key = config.samples_per_iteration, jax.random.key(0)
+    obs, next_obs = jax.random.normal(key, (2, size, int(env.observation_size)))  # pyright: ignore[reportArgumentType]
+    action, row = jax.random.normal(key, (size, env.action_size)), jax.random.normal(key, (size,))
+    quantiles = algorithm.critic.predict(algorithm.critic.init(key), obs)
+    log_prob = jnp.zeros(size) - env.action_size
+    batch = Batch(obs, action, log_prob, row, quantiles, row, row, next_obs, jnp.ones(size, bool))
+    found = []
+    for network, update in ((algorithm.policy, algorithm.policy_update), (algorithm.critic, algorithm.critic_update)):
+        params = network.init(key)
+        _, *turns = counted(partial(update.step, key))(Fit(params, update.init(params)), batch)
+        found.append([int(x) for x in turns])
+    return found
+
+
+def main() -> None:
+    """Print both tables, in Markdown."""
+    arguments = parse(Arguments, "Turns of loops in a step and in an update.")
+    print(f"| one environment step of {arguments.worlds:,} worlds, `jax` | known length | `while` | together |\n|---|---|---|---|")
+    for name in TASKS:
+        known, other = of_step(name, arguments.worlds, arguments.steps)
+        print(f"| {name} | {known:,.0f} | {other:,.0f} | {known + other:,.0f} |", flush=True)
+    print("\n| one update | policy: known length | `while` | critic: known length | `while` |\n|---|---|---|---|---|")
+    for algo in ("ppo", "dppo", "trpo", "dtrpo", "a2c", "da2c"):
+        policy, critic = of_update(algo)
+        print(f"| {algo} | {policy[0]:,} | {policy[1]:,} | {critic[0]:,} | {critic[1]:,} |", flush=True)
+
+
+if __name__ == "__main__":
+    main()
