@@ -1,5 +1,6 @@
 """Small runs, for the tests of what a run leaves on disk."""
 
+import shutil
 import tempfile
 from pathlib import Path
 
@@ -39,3 +40,12 @@ def timeless(run_dir):
 
 def last(run_dir):
     return max((run_dir / "checkpoints").iterdir())
+
+
+def stopped_half_way(whole, half):
+    """A copy of a finished run as a crash after its first checkpoint would have left it, a torn line included."""
+    shutil.copytree(whole, half)
+    last(half).unlink()
+    (half / "evaluation.json").unlink()
+    with (half / "metrics.jsonl").open("a") as file:
+        file.write('{"iteration": 9, "ste')

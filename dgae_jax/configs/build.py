@@ -6,6 +6,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+from jax.sharding import Mesh
 
 import dgae_jax.configs.pytree  # noqa: F401
 from dgae_jax.configs.config import Config, ConfigError, CriticConfig, PolicyConfig, lookup
@@ -94,14 +95,17 @@ def _size(env: Env) -> int:
     return int(env.observation_size)  # pyright: ignore[reportArgumentType]
 
 
-def make_trainer(env: Env, capacity: int) -> parallel.Trainer:
-    """The compiled programs of runs on `env`, for `init(config, keys)` and up to `capacity` iterations per dispatch."""
+def make_trainer(env: Env, capacity: int, mesh: Mesh | None = None) -> parallel.Trainer:
+    """The compiled programs of runs on `env`, for `init(config, keys)` and up to `capacity` iterations per dispatch.
+
+    The devices of `mesh` (`learn.devices.make_mesh`) share the work; by default there is one.
+    """
 
     def parts(config: Config):
         config = validate(config)
         return make_train(make_algorithm(str(config.algo), env, config), env, config)
 
-    return parallel.make_trainer(parts, capacity)
+    return parallel.make_trainer(parts, capacity, mesh)
 
 
 def seed_keys(config: Config) -> jax.Array:

@@ -7,10 +7,10 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Bool, Key
 
 from dgae_jax.envs.base import Env
-from dgae_jax.learn import normalizers
+from dgae_jax.learn import devices, normalizers
 from dgae_jax.learn.diagnostics import Diagnose, nothing
 from dgae_jax.learn.rollout import Act, Episodes, rollout, start
-from dgae_jax.learn.types import Algorithm, Batch, Fit, Fitted, TrainState, Transition, Update
+from dgae_jax.learn.types import Algorithm, Batch, Fit, Fitted, TrainState, Transition
 from dgae_jax.maths import gaussian
 from dgae_jax.maths.returns import decay, lambda_return, lambda_sum
 from dgae_jax.maths.statistics import explained_variance
@@ -45,7 +45,7 @@ def make_train(
             critic=Fit(critic, algorithm.critic_update.init(critic)),
             observations=normalizers.observations(obs_size) if normalize_observations else None,
             reward_scale=normalizers.reward_scale(num_envs),
-            episodes=start(env, env_key, num_envs),
+            episodes=devices.divide(start(env, jax.random.split(env_key, num_envs))),
             key=key,
             iteration=jnp.int32(0),
             failures=jnp.int32(0),
@@ -54,22 +54,31 @@ def make_train(
     @jax.default_matmul_precision("highest")  # TF32 ruins training on GPUs that default to it
     def train_step(state: TrainState) -> tuple[TrainState, Metrics]:
         act_key, target_key, policy_key, critic_key, key = jax.random.split(state.key, 5)
-        act = _acting(algorithm, Fitted(state.policy.params, state.observations))
-        episodes, step = rollout(env, act, state.episodes, act_key, horizon=horizon, episode_length=episode_length)
+
+        def roll_out(actor: Fitted, episodes: Episodes, keys: Key[Array, "T N"]) -> tuple[Episodes, Transition]:
+            return rollout(env, _acting(algorithm, actor), episodes, keys, episode_length=episode_length)
+
+        actor, keys = Fitted(state.policy.params, state.observations), jax.random.split(act_key, (horizon, num_envs))
+        episodes, step = devices.divided(roll_out, (None, 0, 1), (0, 1))(actor, state.episodes, keys)
+        step = devices.gather(step)
         reward_scale, reward, observations = state.reward_scale, step.reward, state.observations
         if normalize_rewards:
             done = (step.terminated | step.truncated).astype(reward.dtype)
             reward_scale, reward = normalizers.rescale(reward_scale, reward, done, step.valid, gamma)
         batch, estimates = _estimate(algorithm, state, step, reward, target_key, gamma, lam, diagnose)
-        policy, policy_info, policy_finite = _improve(algorithm.policy_update, policy_key, state.policy, batch)
-        critic, critic_info, critic_finite = _improve(algorithm.critic_update, critic_key, state.critic, batch)
+        (new_policy, policy_info), (new_critic, critic_info) = devices.side_by_side(
+            (algorithm.policy_update.step, (policy_key, state.policy, batch)),
+            (algorithm.critic_update.step, (critic_key, state.critic, batch)),
+        )
+        policy, policy_finite = _kept_if_finite(new_policy, policy_info, state.policy)
+        critic, critic_finite = _kept_if_finite(new_critic, critic_info, state.critic)
         if normalize_observations:
             observations = normalizers.observe(observations, step.obs, step.valid)
         updated = policy_finite & critic_finite
         failures = jnp.where(updated & (step.valid.mean() >= 0.5), 0, state.failures + 1)
         metrics = {
             **_account(episodes, step),
-            "nonfinite": episodes.nonfinite - state.episodes.nonfinite,
+            "nonfinite": (episodes.nonfinite - state.episodes.nonfinite).sum(),
             "skipped": 1.0 - updated,
             **{f"policy/{name}": value for name, value in policy_info.items()},
             **{f"critic/{name}": value for name, value in critic_info.items()},
@@ -80,19 +89,18 @@ def make_train(
     return init, train_step
 
 
-def _improve(update: Update, key: Key[Array, ""], fit: Fit, batch: Batch) -> tuple[Fit, Metrics, Bool[Array, ""]]:
+def _kept_if_finite(new: Fit, info: Metrics, before: Fit) -> tuple[Fit, Bool[Array, ""]]:
     """One network's update, left out if it is not finite: policy and critic each stand for themselves."""
-    new, info = update.step(key, fit, batch)
     finite = jnp.stack([jnp.isfinite(x).all() for x in jax.tree.leaves((new, info["loss"]))]).all()
-    return jax.tree.map(lambda after, before: jnp.where(finite, after, before), new, fit), info, finite
+    return jax.tree.map(lambda after, before: jnp.where(finite, after, before), new, before), finite
 
 
 def _acting(algorithm: Algorithm, actor: Fitted) -> Act:
     """Actions drawn from the policy, and their log-probabilities."""
 
-    def act(key: Array, obs: Array) -> tuple[Array, Array]:
+    def act(keys: Array, obs: Array) -> tuple[Array, Array]:
         distribution = algorithm.policy.apply(actor.params, normalizers.normalize(actor.observations, obs))
-        action = gaussian.sample(key, distribution)
+        action = jax.vmap(gaussian.sample)(keys, distribution)
         return action, gaussian.log_prob(distribution, action)
 
     return act

@@ -6,8 +6,10 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+from jax.sharding import Mesh
 from jaxtyping import ArrayLike
 
+from dgae_jax.learn import devices
 from dgae_jax.learn.iteration import Metrics
 from dgae_jax.learn.types import TrainState
 
@@ -22,18 +24,27 @@ class Trainer(NamedTuple):
     `count` on are zero. The buffers of the input state are donated."""
 
 
-def make_trainer(make_train: Callable[[Any], tuple[Callable, Callable]], capacity: int) -> Trainer:
+COMPILER_OPTIONS = {"xla_disable_hlo_passes": "cpu-parallel-task-assigner"}
+"""On a CPU XLA would divide single operations between threads, which costs more than operations of this size take."""
+
+
+def make_trainer(make_train: Callable[[Any], tuple[Callable, Callable]], capacity: int, mesh: Mesh | None = None) -> Trainer:
     """Compile once, run any number of iterations per call; traced leaves of the configuration may change between calls.
 
-    `make_train(config) -> (init(key) -> state, train_step(state) -> (state, metrics))`.
+    `make_train(config) -> (init(key) -> state, train_step(state) -> (state, metrics))`; the devices of `mesh` share the work.
     """
 
-    @jax.jit
+    @partial(jax.jit, compiler_options=COMPILER_OPTIONS)
     def init(config: Any, keys: jax.Array) -> TrainState:
-        return over_seeds(make_train(config)[0])(keys)
+        with devices.shared_by(mesh):
+            return over_seeds(make_train(config)[0])(keys)
 
-    @partial(jax.jit, donate_argnums=1)
+    @partial(jax.jit, donate_argnums=1, compiler_options=COMPILER_OPTIONS)
     def dispatch(config: Any, state: TrainState, count: ArrayLike):
+        with devices.shared_by(mesh):
+            return iterated(config, state, count)
+
+    def iterated(config: Any, state: TrainState, count: ArrayLike):
         step = jax.jit(over_seeds(make_train(config)[1]))  # jitted, so that asking for its shapes does not trace it twice
         rows = jax.tree.map(lambda x: jnp.zeros((capacity, *x.shape), x.dtype), jax.eval_shape(step, state)[1])
 
@@ -48,14 +59,21 @@ def make_trainer(make_train: Callable[[Any], tuple[Callable, Callable]], capacit
 
 
 def over_seeds(f: Callable) -> Callable:
-    """`f` mapped over the leading axis of its argument.
+    """`f` mapped over the leading axis of its argument, which is divided between devices where that comes out even.
 
     An axis of one is taken off and put back: XLA's CPU code for arrays with a leading 1 is several times slower.
     """
 
-    def mapped(tree):
-        if jax.tree.leaves(tree)[0].shape[0] > 1:
+    def mapped(tree: Any) -> Any:
+        if _seeds(tree) > 1:
             return jax.vmap(f)(tree)
         return jax.tree.map(lambda x: jnp.expand_dims(x, 0), f(jax.tree.map(lambda x: x[0], tree)))
 
-    return mapped
+    def shared(tree: Any) -> Any:
+        return (devices.divided(mapped, (0,), 0) if _seeds(tree) % devices.count() == 0 else mapped)(tree)
+
+    return shared
+
+
+def _seeds(tree: Any) -> int:
+    return jax.tree.leaves(tree)[0].shape[0]

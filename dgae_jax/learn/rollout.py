@@ -11,7 +11,7 @@ from dgae_jax.envs.base import Env
 from dgae_jax.learn.types import Transition
 
 Act = Callable[[Array, Array], tuple[Array, Array]]
-"""`act(key, obs [N, O]) -> (action [N, A], log_prob [N])`."""
+"""`act(keys [N], obs [N, O]) -> (action [N, A], log_prob [N])`: what a world draws depends on its own key alone."""
 
 
 class Episodes(NamedTuple):
@@ -25,19 +25,19 @@ class Episodes(NamedTuple):
     """Undiscounted return of the last episode that ended in this world; NaN before the first."""
     last_steps: Float[Array, " N"]
     """Its length; NaN before the first."""
-    nonfinite: Int[Array, ""]
-    """Worlds that have turned non-finite so far."""
+    nonfinite: Int[Array, " N"]
+    """How often the world has turned non-finite so far."""
     incident: Any
-    """`(env state before, action)` of the last of them."""
+    """`(env state before, action [N, A])` of the last time."""
 
 
-def start(env: Env, key: Key[Array, ""], num_envs: int) -> Episodes:
-    """`num_envs` worlds at the beginning of an episode each."""
-    state = jax.vmap(env.reset)(jax.random.split(key, num_envs))
-    zero = jnp.zeros_like(state.reward)
+def start(env: Env, keys: Key[Array, " N"]) -> Episodes:
+    """A world per key, at the beginning of an episode each."""
+    state, count = jax.vmap(env.reset)(keys), len(keys)
+    zero, none = jnp.zeros_like(state.reward), jnp.zeros(count, jnp.int32)
     never = jnp.full_like(zero, jnp.nan)
-    nothing = jax.tree.map(lambda x: x[0], state.pipeline_state), jnp.zeros(env.action_size, zero.dtype)
-    return Episodes(state, jnp.zeros(num_envs, jnp.int32), zero, never, never, jnp.int32(0), nothing)
+    nothing = state.pipeline_state, jnp.zeros((count, env.action_size), zero.dtype)
+    return Episodes(state, none, zero, never, never, none, nothing)
 
 
 def _where(mask: Bool[Array, " N"], yes: Any, no: Any) -> Any:
@@ -63,10 +63,8 @@ def _quarantine(step: Transition, valid: Bool[Array, " N"]) -> Transition:
 
 
 def _record(episodes: Episodes, attempt: Any, valid: Bool[Array, " N"]) -> Episodes:
-    """Count the invalid worlds and keep the state before and the action of the first of them."""
-    world = jnp.argmin(valid)
-    incident = jax.tree.map(lambda new, old: jnp.where(valid.all(), old, new[world]), attempt, episodes.incident)
-    return episodes._replace(nonfinite=episodes.nonfinite + (~valid).sum(), incident=incident)
+    """Count the invalid steps, and keep the state before and the action of each world's last."""
+    return episodes._replace(nonfinite=episodes.nonfinite + ~valid, incident=_where(valid, episodes.incident, attempt))
 
 
 def _advance(episodes: Episodes, after: Any, step: Transition, fresh: Episodes) -> Episodes:
@@ -83,10 +81,8 @@ def _advance(episodes: Episodes, after: Any, step: Transition, fresh: Episodes) 
     )
 
 
-def rollout(
-    env: Env, act: Act, episodes: Episodes, key: Key[Array, ""], *, horizon: int, episode_length: int
-) -> tuple[Episodes, Transition]:
-    """`horizon` steps in every world. The action is clipped to the actuators' range before it acts, not in the record.
+def rollout(env: Env, act: Act, episodes: Episodes, keys: Key[Array, "T N"], *, episode_length: int) -> tuple[Episodes, Transition]:
+    """T steps in every world, each with its own key: how worlds are divided over devices changes nothing. The action is clipped to the actuators' range before it acts, not in the record.
 
     An episode that ends is followed by a fresh random one; `next_obs` stays the observation in which it ended. A world
     whose action, state, reward or observation turns non-finite is quarantined: its episode ends there as terminated
@@ -94,10 +90,10 @@ def rollout(
     """
     low, high = env.action_range
 
-    def one(episodes: Episodes, key: Key[Array, ""]):
-        act_key, reset_key = jax.random.split(key)
+    def one(episodes: Episodes, keys: Key[Array, " N"]):
+        act_keys, reset_keys = jax.vmap(jax.random.split, out_axes=1)(keys)
         before = episodes.env
-        action, log_prob = act(act_key, before.obs)
+        action, log_prob = act(act_keys, before.obs)
         after = jax.vmap(env.step)(before, jnp.clip(action, low, high))
         valid = _finite((before.obs, action, log_prob, after.pipeline_state, after.reward, after.obs, after.done))
         terminated = (after.done > 0) | ~valid
@@ -105,6 +101,6 @@ def rollout(
         step = Transition(before.obs, action, log_prob, after.reward, terminated, truncated, after.obs, valid)  # pyright: ignore[reportArgumentType]
         step = _quarantine(step, valid)
         episodes = _record(episodes, (before.pipeline_state, action), valid)
-        return _advance(episodes, after, step, start(env, reset_key, valid.shape[0])), step
+        return _advance(episodes, after, step, start(env, reset_keys)), step
 
-    return jax.lax.scan(one, episodes, jax.random.split(key, horizon))
+    return jax.lax.scan(one, episodes, keys)

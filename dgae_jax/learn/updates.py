@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import optax
 from jaxtyping import Array, ArrayLike
 
+from dgae_jax.learn import devices
 from dgae_jax.learn.types import Batch, Fit, Params, Policy, Update
 from dgae_jax.maths import gaussian
 
@@ -62,7 +63,7 @@ def sgd(loss: Loss, optimizer: optax.GradientTransformation, *, epochs: int, min
             raise ValueError(f"a batch of {size} samples does not divide into {minibatches} minibatches")
 
         def epoch(fit: Fit, key: jax.Array):
-            order = jax.random.permutation(key, size).reshape(minibatches, -1)
+            order = devices.divide(jax.random.permutation(key, size).reshape(minibatches, -1), axis=1)
             return jax.lax.scan(lambda fit, rows: minibatch(fit, jax.tree.map(lambda x: x[rows], batch)), fit, order)
 
         fit, infos = jax.lax.scan(epoch, fit, jax.random.split(key, epochs))
@@ -83,7 +84,7 @@ def trust_region(
     """
 
     def step(key: jax.Array, fit: Fit, batch: Batch):
-        old = fit.params
+        old, batch = fit.params, devices.divide(batch)
         (start, info), gradient = jax.value_and_grad(loss, has_aux=True)(old, batch)
         fisher = fisher_product(policy, old, batch.obs[::fisher_every], damping)
         direction, _ = jax.scipy.sparse.linalg.cg(fisher, jax.tree.map(jnp.negative, gradient), maxiter=cg_iterations, tol=1e-10)

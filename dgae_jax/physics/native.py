@@ -3,11 +3,11 @@
 It compiles in seconds, runs on CPU threads, and is the referee for the other engines.
 """
 
+import contextlib
 import hashlib
 import math
 import os
-import threading
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from functools import partial
 
 import jax
@@ -28,20 +28,16 @@ def cores() -> int:
 
 
 class _Host:
-    """Keeps one batch of simulations per batch size; the call's only memory is these buffers."""
+    """Keeps simulations per batch size, and takes others where those are in use: CPU devices of JAX call side by side."""
 
     def __init__(self, model: mujoco.MjModel, frame_skip: int, reads: Reads):
         self.model, self.frame_skip, self.reads, self.bodies = model, frame_skip, reads, body_ids(model, reads)
-        self.threads = cores()
-        self.batches: dict[int, Batch] = {}
-        self.data = mujoco.MjData(model)
-        self.lock = threading.Lock()  # a Batch serves one caller at a time
+        self.free: dict[int, list[Batch]] = {}
 
     def step(self, before: Sequence[np.ndarray], after: Sequence[np.ndarray]) -> None:
         """Fill the fields of a `PhysicsState` after a step, from those in `_FIELDS` and the control before it."""
         count = math.prod(before[0].shape[:-1])
-        with self.lock, quiet.silenced():
-            batch = self._batch(count)
+        with self._batch(count) as batch, quiet.silenced():
             for name, array in zip((*_FIELDS, "ctrl"), before, strict=True):
                 batch.bind(name)[:] = array.reshape(count, -1)
             warned = _warnings(batch)
@@ -58,20 +54,27 @@ class _Host:
         self.step([np.asarray(x) for x in before], after)
         return after
 
-    def _batch(self, count: int) -> Batch:
-        if count not in self.batches:
+    @contextlib.contextmanager
+    def _batch(self, count: int) -> Iterator[Batch]:
+        """Simulations that nobody else uses meanwhile; what was written to them before does not count."""
+        free = self.free.setdefault(count, [])
+        try:
+            batch = free.pop()
+        except IndexError:
+            threads = max(1, cores() // jax.local_device_count("cpu"))
             # persistent simulations keep the contacts that the forces are computed from
-            self.batches[count] = Batch(self.model, count, min(self.threads, count), persistent=self.reads.forces)
-            self.batches[count].bind("xpos")  # outputs are copied from the next call on
-        return self.batches[count]
+            batch = Batch(self.model, count, min(threads, count), persistent=self.reads.forces)
+            batch.bind("xpos")  # outputs are copied from the next call on
+        yield batch
+        free.append(batch)
 
     def _forces(self, batch: Batch) -> np.ndarray:
         """`mj_rnePostConstraint` after each step, as Gymnasium does."""
-        forces = np.empty((batch.nsim, self.model.nbody, 6))
+        forces, data = np.empty((batch.nsim, self.model.nbody, 6)), mujoco.MjData(self.model)
         for i in range(batch.nsim):
-            batch.get_data(i, self.data)
-            mujoco.mj_rnePostConstraint(self.model, self.data)
-            forces[i] = self.data.cfrc_ext
+            batch.get_data(i, data)
+            mujoco.mj_rnePostConstraint(self.model, data)
+            forces[i] = data.cfrc_ext
         return forces
 
 

@@ -2,6 +2,7 @@
 
 import contextlib
 import logging
+import threading
 from collections import Counter
 
 import mujoco
@@ -16,15 +17,26 @@ KINDS = tuple(mujoco.mjtWarning(i).name.removeprefix("mjWARN_") for i in range(i
 """BADQACC, CONTACTFULL, …: in MuJoCo's order."""
 
 
+_LOCK, _inside, _usual = threading.Lock(), 0, None
+"""How many callers are within `silenced`, and the handler that is usual outside of it."""
+
+
 @contextlib.contextmanager
 def silenced():
     """Within it, MuJoCo's warnings from any thread are neither printed nor written to a file."""
-    before = mujoco.get_mju_user_warning()
-    mujoco.set_mju_user_warning(lambda message: None)
+    global _inside, _usual
+    with _LOCK:
+        if not _inside:
+            _usual = mujoco.get_mju_user_warning()
+            mujoco.set_mju_user_warning(lambda message: None)
+        _inside += 1
     try:
         yield
     finally:
-        mujoco.set_mju_user_warning(before)
+        with _LOCK:
+            _inside -= 1
+            if not _inside:
+                mujoco.set_mju_user_warning(_usual)
 
 
 def count(numbers: np.ndarray) -> None:

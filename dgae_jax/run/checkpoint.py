@@ -23,8 +23,8 @@ from dgae_jax.run import files
 
 T = TypeVar("T")
 
-SCHEMA = 2
-"""Version of the file format. In 1 the physics `jax` was called `mjx`."""
+SCHEMA = 3
+"""Version of the file format. In 1 the physics `jax` was called `mjx`; up to 2 the worlds of a run drew from one key together."""
 
 ARRAY = 1
 """Msgpack's extension type of an array: shape, name of the dtype and bytes, as Flax writes it."""
@@ -197,8 +197,9 @@ def _header(path: Path, line: bytes) -> str:
     if type(schema) is not int:
         raise DamagedError(f"{path}: is damaged (no schema)")
     if schema < SCHEMA:
-        renamed = "what it calls physics mjx is now called jax; continue it with the version that wrote it, or train again"
-        raise CheckpointError(f"{path}: has schema {schema}, this version reads schema {SCHEMA}: {renamed}")
+        why = "what it calls physics mjx is now called jax" if schema < 2 else "its worlds drew random numbers in another way"
+        way = "continue it with the version that wrote it, or train again"
+        raise CheckpointError(f"{path}: has schema {schema}, this version reads schema {SCHEMA}: {why}; {way}")
     if schema > SCHEMA:
         raise CheckpointError(f"{path}: has schema {schema}, of a newer version; this version reads schema {SCHEMA}")
     return checksum

@@ -33,7 +33,7 @@ def start(config: Config, options: RunOptions) -> Finished:
     Raises ConfigError before anything is written or compiled if the configuration or a path is invalid, RunError if the run
     ends early.
     """
-    config = _prepared(config, options)
+    config, options = _prepared(config, options)
     run_dir = options.run_dir or directory.default_path(config)
     directory.create(run_dir, config, options)
     with directory.locked(run_dir):
@@ -46,10 +46,10 @@ def go_on(config: Config, options: RunOptions) -> Finished:
     Raises as `start`; ConfigError also, naming both values, for a setting other than `total_steps` that differs from the run's,
     or for another machine or version; CheckpointError if no checkpoint can be loaded.
     """
-    config = _prepared(config, options)
+    config, options = _prepared(config, options)
     run_dir = options.resume
     assert run_dir is not None
-    _compare(config, directory.read_config(run_dir), run_dir, options.inexact)
+    _compare(config, directory.read_config(run_dir), run_dir, options)
     with directory.locked(run_dir):
         return Finished(run_to_end(config, options, run_dir, _last_state(run_dir, config)), run_dir)
 
@@ -90,23 +90,23 @@ def _exit_code(work: Callable[[Config, RunOptions], Finished], config: Config, o
     return 0
 
 
-def _prepared(config: Config, options: RunOptions) -> Config:
-    """The configuration in full, after a look at everything that can be seen before work begins."""
+def _prepared(config: Config, options: RunOptions) -> tuple[Config, RunOptions]:
+    """Configuration and options in full, after a look at everything that can be seen before work begins."""
     config = validate(config)
     validate_options(options)
-    machine.use_device(config)
+    devices = machine.use_devices(config, options.devices)
     machine.use_cache(options.cache_dir)
     check_memory(config, make_task(config), machine.memory())
-    return config
+    return config, dataclasses.replace(options, devices=devices)
 
 
-def _compare(config: Config, saved: Config, run_dir: Path, inexact: bool) -> None:
-    """Refuse what would not continue the run `saved`, but for what `inexact` allows."""
-    changed = differences(config, saved)
+def _compare(config: Config, saved: Config, run_dir: Path, options: RunOptions) -> None:
+    """Refuse what would not continue the run `saved`, but for what --inexact allows."""
+    changed, inexact = differences(config, saved), options.inexact
     for path, (ours, theirs) in changed.items():
         if path not in MAY_CHANGE or (path == "physics" and not inexact):
             raise invalid(path, ours, f"{theirs} as in {run_dir}, or left out")
-    elsewhere = "; ".join(manifest.changes(run_dir))
+    elsewhere = "; ".join(manifest.changes(run_dir, options))
     if elsewhere and not inexact:
         raise ConfigError(f"resume {run_dir}: must go on where it began, or with --inexact; now {elsewhere}", "resume")
     if "physics" in changed:

@@ -1,5 +1,6 @@
 """The machine a run is on."""
 
+import contextlib
 import os
 import platform
 from pathlib import Path
@@ -16,8 +17,39 @@ _SETTINGS = ("jax_enable_x64", "jax_default_prng_impl", "jax_threefry_partitiona
 """Of JAX, which the environment may change and on which the bits depend."""
 
 
-def use_device(config: Config) -> None:
-    """Start JAX on its device; raises ConfigError if there is none of the kind asked for."""
+WORLDS_PER_CORE = 16
+"""Fewer are stepped no faster: at that number every operation takes as long as its start."""
+
+
+def use_devices(config: Config, wanted: int | None = None) -> int:
+    """Start JAX, and the number of its devices that share a run.
+
+    Raises ConfigError if there is none of the kind asked for, or `wanted` are not there or do not divide worlds or seeds.
+    """
+    with contextlib.suppress(RuntimeError):  # JAX runs already, and has the devices that it has
+        jax.config.update("jax_num_cpu_devices", wanted or _dividing(config, cores(), WORLDS_PER_CORE))
+    _start(config)
+    there = jax.device_count()
+    if wanted is None:
+        return _dividing(config, there, 1)
+    if wanted > there:
+        raise invalid("devices", wanted, f"at most {there}, which JAX has here (a CPU is divided before JAX starts)")
+    if _dividing(config, wanted, 1) != wanted:
+        raise invalid("devices", wanted, f"a number that divides num_envs {config.num_envs} or num_seeds {config.num_seeds}")
+    return wanted
+
+
+def _dividing(config: Config, most: int, worlds_each: int) -> int:
+    """The largest number of devices up to `most` between which seeds or worlds can be divided evenly."""
+
+    def fits(count: int) -> bool:
+        seeds = config.num_seeds > 1 and config.num_seeds % count == 0
+        return seeds or (config.num_envs % count == 0 and config.num_envs >= count * worlds_each)
+
+    return next((count for count in range(most, 1, -1) if fits(count)), 1)
+
+
+def _start(config: Config) -> None:
     try:
         kind = jax.devices()[0].platform
     except Exception as reason:  # JAX raises many kinds, an AssertionError without a word for a missing plugin
@@ -48,7 +80,6 @@ def facts() -> dict[str, Any]:
     """What of the machine decides how numbers are rounded."""
     return {
         "device": f"{jax.default_backend()}: {_model()}",
-        "devices": jax.device_count(),
         "cores": _cores(),
         "settings": {name: getattr(jax.config, name, None) for name in _SETTINGS} | {"XLA_FLAGS": os.environ.get("XLA_FLAGS")},
     }

@@ -18,13 +18,13 @@ _VERSIONS_OF = ("dgae_jax", "jax", "jaxlib", "flax", "optax", "brax", "mujoco", 
 
 def write(run_dir: Path, options: RunOptions) -> None:
     """The first part of a run."""
-    files.write_json(run_dir / "manifest.json", {**_now(), "options": to_dict(options), "resumed": []})
+    files.write_json(run_dir / "manifest.json", {**_now(options), "resumed": []})
 
 
 def add(run_dir: Path, options: RunOptions) -> None:
     """A part that continues it."""
     before = _read(run_dir)
-    parts = [*_resumed(before), {**_now(), "options": to_dict(options)}]
+    parts = [*_resumed(before), _now(options)]
     files.write_json(run_dir / "manifest.json", {**before, "resumed": parts})
 
 
@@ -33,17 +33,18 @@ def options(run_dir: Path) -> RunOptions:
     return from_dict(_last(run_dir).get("options"))
 
 
-def changes(run_dir: Path) -> list[str]:
+def changes(run_dir: Path, options: RunOptions) -> list[str]:
     """What decides the bits of a result and is not what it was in the last part of the run."""
-    was, now = _deciding(_last(run_dir)), _deciding(_now())
+    was, now = _deciding(_last(run_dir)), _deciding(_now(options))
     return [f"{name} {value} (was {was.get(name)})" for name, value in now.items() if was.get(name) != value]
 
 
 def _deciding(part: dict[str, Any]) -> dict[str, Any]:
-    found = {name: part.get(name) for name in ("device", "devices", "cores", "git_revision")}
+    found = {name: part.get(name) for name in ("device", "cores", "git_revision")}
     for table in (part.get("settings"), part.get("versions")):
         found |= table if isinstance(table, dict) else {}
-    return found
+    options = part.get("options")
+    return found | {"devices": options.get("devices") if isinstance(options, dict) else None}
 
 
 def _last(run_dir: Path) -> dict[str, Any]:
@@ -66,7 +67,7 @@ def _resumed(manifest: dict[str, Any]) -> list[Any]:
     return found if isinstance(found, list) else []
 
 
-def _now() -> dict[str, Any]:
+def _now(options: RunOptions) -> dict[str, Any]:
     from dgae_jax.run import machine  # JAX is loaded when a run begins, not to read an old manifest
 
     return {
@@ -77,6 +78,7 @@ def _now() -> dict[str, Any]:
         "platform": platform.platform(),
         **machine.facts(),
         "versions": {name: _version(name) for name in _VERSIONS_OF},
+        "options": to_dict(options),
     }
 
 

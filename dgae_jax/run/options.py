@@ -19,6 +19,9 @@ class RunOptions:
     """Samples of each run between checkpoints, which are evaluated too; one is always saved at the end [environment steps]."""
     keep_checkpoints: int = 3
     """The newest checkpoints that are kept, beside the one with the best evaluation [files]."""
+    devices: int | None = None
+    """Devices that share the run, which divide its worlds or its seeds; by default all, and of a CPU's cores as many as have 16
+    worlds each [devices]."""
     resume: Path | None = None
     """Continue the run in this directory, bit for bit, with its flags where none are given [path]."""
     resume_or_start: bool = False
@@ -30,10 +33,11 @@ class RunOptions:
     episodes: int = 20
     """Episodes of every evaluation in Gymnasium, per run [episodes]."""
     debug_nonfinite: bool = False
-    """Write the state and action of worlds that turn non-finite to nonfinite/ in the run directory, for replay."""
+    """Write the states and actions from which worlds turn non-finite to nonfinite/ in the run directory, for replay."""
 
 
 WHOLE = {
+    "devices": (1, 1_000_000, "of one machine"),
     "checkpoint_every": (1, 2**31 - 1, "samples are counted in an int32"),
     "keep_checkpoints": (1, 1_000_000, "files in one directory"),
     "max_nonfinite": (1, 2**31 - 1, "iterations are counted in an int32"),
@@ -46,7 +50,7 @@ def validate_options(options: RunOptions) -> None:
     """Raise `ConfigError` for the first option that is invalid."""
     for name, (low, high, reason) in WHOLE.items():
         value = getattr(options, name)
-        if not low <= value <= high:
+        if value is not None and not low <= value <= high:
             raise invalid(name, value, f"a whole number from {low:,} to {high:,} ({reason})")
     if options.resume is not None and options.run_dir is not None:
         raise invalid("run_dir", options.run_dir, f"left out: --resume writes to {options.resume}")
@@ -58,7 +62,7 @@ def validate_options(options: RunOptions) -> None:
         raise invalid("inexact", True, "left out without --resume")
 
 
-_KEPT = ("checkpoint_every", "keep_checkpoints", "max_nonfinite", "episodes", "debug_nonfinite")
+_KEPT = ("devices", "checkpoint_every", "keep_checkpoints", "max_nonfinite", "episodes", "debug_nonfinite")
 """What a run goes on with when it is resumed."""
 
 
@@ -70,5 +74,5 @@ def to_dict(options: RunOptions) -> dict[str, Any]:
 def from_dict(data: Any) -> RunOptions:
     """What `to_dict` wrote; defaults for all else."""
     found = data if isinstance(data, dict) else {}
-    usual = to_dict(RunOptions())
+    usual = to_dict(RunOptions(devices=1))
     return RunOptions(**{name: found[name] for name in _KEPT if type(found.get(name)) is type(usual[name])})

@@ -88,14 +88,16 @@ class Record:
         self._write(_plot, self.run_dir / "curve.png", *self.metrics.curve(), title, self.evaluations.points())
 
     def _save_incidents(self, state: TrainState, seeds: set[int]) -> None:
-        """The last state and action from which a world turned non-finite, per run and dispatch: arrays by name, and action."""
+        """Of every world that has turned non-finite the last state and action from which it did, per run: arrays by name."""
         for seed in sorted(seeds):
-            world, action = jax.tree.map(lambda x, i=seed - self.config.seed: np.asarray(x[i]), state.episodes.incident)
+            episodes = jax.tree.map(lambda x, i=seed - self.config.seed: np.asarray(x[i]), state.episodes)
+            worlds = np.flatnonzero(episodes.nonfinite)
+            world, action = jax.tree.map(lambda x, at=worlds: x[at], episodes.incident)
             names = world._fields if isinstance(world, PhysicsState) else range(len(jax.tree.leaves(world)))
             arrays = {str(name): leaf for name, leaf in zip(names, jax.tree.leaves(world), strict=True)}
             directory = self.run_dir / "nonfinite"
             directory.mkdir(exist_ok=True)
-            np.savez(directory / f"steps_{self.steps:012d}_seed_{seed}.npz", **arrays, action=action)
+            np.savez(directory / f"steps_{self.steps:012d}_seed_{seed}.npz", world=worlds, **arrays, action=action)
 
 
 def _plot(path: Path, *data) -> None:

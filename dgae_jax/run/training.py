@@ -10,6 +10,7 @@ import numpy as np
 
 from dgae_jax.configs.build import make_task, make_trainer, policies_of, seed_keys
 from dgae_jax.configs.config import Config
+from dgae_jax.learn.devices import make_mesh
 from dgae_jax.learn.parallel import Trainer
 from dgae_jax.learn.types import TrainState
 from dgae_jax.run import checkpoint, directory, files, manifest, terminal
@@ -72,7 +73,7 @@ def _iterate(config: Config, options: RunOptions, record: Record, signals: Signa
     done, count, seconds = record.metrics.iteration, 1, 0.0
     if state is not None and done == config.iterations:
         return state
-    trainer = make_trainer(make_task(config), CAPACITY)
+    trainer = make_trainer(make_task(config), CAPACITY, make_mesh(options.devices or 1))
     with Reporter(config.iterations * config.samples_per_iteration, config.num_seeds) as reporter:
         resumed = state is not None
         state = _compiled(config, trainer, state, signals, reporter)
@@ -125,7 +126,7 @@ def _look(record: Record, state: TrainState, signals: Signals, reporter: Reporte
     """Evaluate on the way, unless a signal came: a run that goes on later makes up for it."""
     if not record.evaluated:
         with contextlib.suppress(Stopped), signals.may_stop():
-            record.evaluate(policies_of(state), reporter.watch)
+            record.evaluate(jax.device_get(policies_of(state)), reporter.watch)
 
 
 def _evaluate(config: Config, options: RunOptions, record: Record, signals: Signals, state: TrainState) -> dict[str, Any]:
@@ -133,7 +134,7 @@ def _evaluate(config: Config, options: RunOptions, record: Record, signals: Sign
     with signals.may_stop(), Reporter() as reporter:
         episodes = f"{options.episodes} episodes" + (f" of each of {config.num_seeds} seeds" if config.num_seeds > 1 else "")
         reporter.announce(f"evaluating {episodes} in {referee(config)} ({engines_of(config)[0]})")
-        return record.evaluate(policies_of(state), reporter.watch)
+        return record.evaluate(jax.device_get(policies_of(state)), reporter.watch)
 
 
 def _broken(state: TrainState, options: RunOptions) -> bool:

@@ -19,6 +19,7 @@ from dgae_jax.configs.validation import validate
 from dgae_jax.run import checkpoint, files, manifest, metrics
 from dgae_jax.run.checkpoint import CheckpointError
 from dgae_jax.run.evaluations import EvaluationsFile
+from dgae_jax.run.options import RunOptions
 from tests.helpers import signed
 
 many = settings(max_examples=600, deadline=None, suppress_health_check=list(HealthCheck), derandomize=True)
@@ -121,9 +122,9 @@ MANIFEST = st.fixed_dictionaries(
 def test_any_manifest_is_another_machine_and_can_be_added_to(tmp_path_factory, data, noise):
     run_dir = tmp_path_factory.mktemp("manifest")
     (run_dir / "manifest.json").write_bytes(json.dumps(data).encode() + noise)
-    assert manifest.changes(run_dir)
+    assert manifest.changes(run_dir, RunOptions())
     manifest.add(run_dir, manifest.options(run_dir))
-    assert manifest.changes(run_dir) == []
+    assert manifest.changes(run_dir, manifest.options(run_dir)) == []
 
 
 BODY = msgpack.packb(

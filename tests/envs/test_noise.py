@@ -15,7 +15,7 @@ def collect(env, key, horizon=400):
     def act(key, obs):
         return jnp.zeros((obs.shape[0], 1)), jnp.zeros(obs.shape[0])
 
-    return rollout(env, act, start(env, key, 16), key, horizon=horizon, episode_length=50)[1]
+    return rollout(env, act, start(env, jax.random.split(key, 16)), jax.random.split(key, (horizon, 16)), episode_length=50)[1]
 
 
 def test_without_noise_the_task_is_left_as_it_is():

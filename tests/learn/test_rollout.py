@@ -14,7 +14,11 @@ def act(key, obs):
 
 def run(env, key, *, worlds=4, horizon=12, episode_length=5):
     start_key, key = jax.random.split(key)
-    return rollout(env, act, start(env, start_key, worlds), key, horizon=horizon, episode_length=episode_length)
+    return rollout(env, act, begin(env, start_key, worlds), jax.random.split(key, (horizon, worlds)), episode_length=episode_length)
+
+
+def begin(env, key, worlds):
+    return start(env, jax.random.split(key, worlds))
 
 
 def test_a_time_limit_truncates_and_never_terminates(key):
@@ -61,8 +65,8 @@ def test_episode_returns_are_undiscounted_sums_and_unknown_before_the_first_end(
 def test_two_rollouts_in_a_row_are_one_long_rollout_in_episode_time(key):
     first, second = jax.random.split(key)
     env = Counter()
-    episodes, a = rollout(env, act, start(env, key, 3), first, horizon=7, episode_length=5)
-    _, b = rollout(env, act, episodes, second, horizon=5, episode_length=5)
+    episodes, a = rollout(env, act, begin(env, key, 3), jax.random.split(first, (7, 3)), episode_length=5)
+    _, b = rollout(env, act, episodes, jax.random.split(second, (5, 3)), episode_length=5)
     assert_array_equal(jnp.concatenate([a.reward, b.reward])[:, 0], [1, 2, 3, 4, 5] * 2 + [1, 2])
 
 
@@ -82,7 +86,7 @@ def test_a_world_that_turns_non_finite_ends_terminated_without_reward_and_starts
     assert_array_equal(step.reward[2], np.where(broken, 0, 3))
     assert_array_equal(step.obs[3, :, 0], np.where(broken, 0, 3))
     assert_array_equal(episodes.last_total, np.where(broken, 1 + 2, np.nan))
-    assert int(episodes.nonfinite) == broken.sum()
+    assert int(episodes.nonfinite.sum()) == broken.sum()
     assert all(np.isfinite(x).all() for x in step)
     assert all(np.isfinite(x).all() for x in (episodes.env.obs, episodes.env.reward, episodes.total))
 
@@ -93,25 +97,38 @@ def test_a_non_finite_action_is_contained_too(key):
         return action, action[:, 0]
 
     start_key, key = jax.random.split(key)
-    episodes, step = rollout(Counter(), sometimes, start(Counter(), start_key, 16), key, horizon=4, episode_length=100)
-    assert 0 < int(episodes.nonfinite) == int(step.terminated[2].sum()) < 16
+    episodes, step = rollout(Counter(), sometimes, begin(Counter(), start_key, 16), jax.random.split(key, (4, 16)), episode_length=100)
+    assert 0 < int(episodes.nonfinite.sum()) == int(step.terminated[2].sum()) < 16
     assert all(np.isfinite(x).all() for x in step)
-    assert jnp.isnan(episodes.incident[1]).all()
+    assert_array_equal(jnp.isnan(episodes.incident[1][:, 0]), episodes.nonfinite > 0)
 
 
 def test_a_state_broken_from_outside_reaches_no_step(key):
-    episodes = start(Counter(), key, 4)
+    episodes = begin(Counter(), key, 4)
     broken = episodes._replace(env=episodes.env.replace(obs=episodes.env.obs.at[1].set(jnp.nan)))
-    episodes, step = rollout(Counter(), act, broken, key, horizon=3, episode_length=100)
+    episodes, step = rollout(Counter(), act, broken, jax.random.split(key, (3, 4)), episode_length=100)
     assert all(np.isfinite(x).all() for x in step)
     assert_array_equal(step.terminated[0], [False, True, False, False])
-    assert int(episodes.nonfinite) == 1
+    assert int(episodes.nonfinite.sum()) == 1
 
 
-def test_the_incident_is_the_state_before_and_the_action(key):
+def test_the_incident_of_a_world_is_the_state_before_and_the_action(key):
     episodes, _ = run(Fragile(jnp.nan, "reward"), key, worlds=16, horizon=3, episode_length=100)
     state, action = episodes.incident
-    assert_array_equal(action, 3.0)
-    assert float(state) == 0
+    broken = np.asarray(episodes.nonfinite) == 1
+    assert 0 < broken.sum() < 16
+    assert_array_equal(action[:, 0], np.where(broken, 3, 0))
+    assert_array_equal(state, 0)
     healthy, _ = run(Counter(), key)
-    assert int(healthy.nonfinite) == 0
+    assert int(healthy.nonfinite.sum()) == 0
+
+
+def test_what_happens_in_a_world_depends_on_its_own_keys_alone(key):
+    def drawn(keys, obs):
+        return jax.vmap(jax.random.normal, (0, None))(keys, (1,)), jnp.zeros(len(keys))
+
+    start_keys, keys = jax.random.split(key, 6), jax.random.split(key, (7, 6))
+    whole, all_steps = rollout(Counter(), drawn, start(Counter(), start_keys), keys, episode_length=5)
+    half, steps = rollout(Counter(), drawn, start(Counter(), start_keys[3:]), keys[:, 3:], episode_length=5)
+    jax.tree.map(lambda a, b: assert_array_equal(a[3:], b), whole._replace(incident=()), half._replace(incident=()))
+    jax.tree.map(lambda a, b: assert_array_equal(a[:, 3:], b), all_steps, steps)

@@ -33,15 +33,20 @@ def test_a_checkpoint_gives_the_state_back_bit_for_bit(state, tmp_path):
         (lambda b: b"\xa3abc", "is damaged"),
         (lambda b: b"\x93\x01\xa1a\x02", "is damaged"),
         (lambda b: b[:-9] + b"x" + b[-8:], "is damaged"),
-        (lambda b: b.replace(b'"schema": 2', b'"schema": 3'), "has schema 3, of a newer version; this version reads schema 2"),
+        (lambda b: b.replace(b'"schema": 3', b'"schema": 4'), "has schema 4, of a newer version; this version reads schema 3"),
         (
-            lambda b: b.replace(b'"schema": 2', b'"schema": 1'),
-            "has schema 1, this version reads schema 2: what it calls physics mjx is now called jax; continue it with the version that "
+            lambda b: b.replace(b'"schema": 3', b'"schema": 2'),
+            "has schema 2, this version reads schema 3: its worlds drew random numbers in another way; continue it with the version that "
+            "wrote it, or train again",
+        ),
+        (
+            lambda b: b.replace(b'"schema": 3', b'"schema": 1'),
+            "has schema 1, this version reads schema 3: what it calls physics mjx is now called jax; continue it with the version that "
             "wrote it, or train again",
         ),
         (lambda b: signed(b.partition(b"\n")[2].replace(b"critic.", b"cretic.")), "is of another run, cretic.* is unknown here"),
-        (lambda b: b.replace(b'"schema": 2', b'"schema": 1e999'), "is damaged"),
-        (lambda b: b.replace(b'"schema": 2', b'"schema": true'), "is damaged"),
+        (lambda b: b.replace(b'"schema": 3', b'"schema": 1e999'), "is damaged"),
+        (lambda b: b.replace(b'"schema": 3', b'"schema": true'), "is damaged"),
         (lambda b: signed(b"\x93\x01\xa1a\x02"), "is damaged"),
         (lambda b: signed(b"\x81\xa1a\xc1"), "is damaged"),
     ],

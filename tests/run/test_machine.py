@@ -23,4 +23,4 @@ def test_whatever_jax_says_about_a_device_is_one_line_that_says_how_to_install_f
     monkeypatch.setattr(jax, "devices", devices)
     monkeypatch.setenv("JAX_PLATFORMS", wanted)
     with pytest.raises(ConfigError, match=rf"^JAX_PLATFORMS={wanted}: must name a device that JAX finds here, .*{said}"):
-        machine.use_device(SMALL)
+        machine.use_devices(SMALL)

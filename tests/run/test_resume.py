@@ -11,16 +11,7 @@ from dgae_jax.configs.config import ConfigError
 from dgae_jax.run import directory, files, manifest, metrics
 from dgae_jax.run.loop import resume, resume_or_start, train
 from dgae_jax.run.options import RunOptions
-from tests.runs import QUIET, SMALL, last, small, timeless
-
-
-def stopped_half_way(whole, half):
-    """A copy of a finished run as a crash after its first checkpoint would have left it, a torn line included."""
-    shutil.copytree(whole, half)
-    last(half).unlink()
-    (half / "evaluation.json").unlink()
-    with (half / "metrics.jsonl").open("a") as file:
-        file.write('{"iteration": 9, "ste')
+from tests.runs import QUIET, SMALL, last, small, stopped_half_way, timeless
 
 
 @pytest.mark.parametrize(
@@ -120,7 +111,7 @@ def test_a_run_that_is_refused_for_its_metrics_is_left_as_it_was(run_dir):
 
 
 def test_a_resumed_run_goes_on_with_its_options(run_dir):
-    assert manifest.options(run_dir) == RunOptions(checkpoint_every=256, episodes=1)
+    assert manifest.options(run_dir) == RunOptions(checkpoint_every=256, episodes=1, devices=1)
     manifest.add(run_dir, RunOptions(keep_checkpoints=7, debug_nonfinite=True))
     assert manifest.options(run_dir) == RunOptions(keep_checkpoints=7, debug_nonfinite=True)
 
