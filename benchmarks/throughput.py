@@ -1,53 +1,106 @@
-"""Compile seconds and training steps per second on Hopper, ours and stable-baselines3's, side by side in one run.
+"""Training steps per second, ours and others', side by side in one run, and what the cores could do at best.
 
-    pip install -e ".[bench]" && python benchmarks/throughput.py
+    pip install -e ".[bench]" && python benchmarks/throughput.py --json benchmarks/results/throughput.json
 
-The same network (2 × 64, tanh), samples per iteration (2,048), epochs (10), minibatches (64 samples), observation and
-reward normalisation. stable-baselines3 runs with one world, with our 16, and with 16 in processes, on one and on all
-threads of torch; its fastest setting is the one to compare with. Nothing else should run on the machine meanwhile.
+Everyone trains on the same task with the same network (tanh), samples per iteration (2,048), epochs, minibatches and
+normalisation. stable-baselines3 and sb3-contrib run with 1, 8 and 16 worlds in one process, 8 and 16 in processes, on one and
+on all threads of torch; the fastest setting is the one to compare with. The roofline is the time of an iteration in which all
+cores do nothing but simulate (C MuJoCo), multiply matrices (the operations that the program counts, at the highest rate
+measured here) and evaluate the residuals of the quantile-Huber loss (at the rate measured here). Nothing else should run on
+the machine meanwhile.
 """
 
 import dataclasses
+import functools
 import itertools
-import os
+import json
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
 
-import gymnasium
 import jax
+import jax.numpy as jnp
+import numpy as np
+import peers
+from mujoco.batch import Batch
+from turns import counted
 
-from dgae_jax import Config
+import dgae_jax as dg
 from dgae_jax.cli.arguments import parse
 from dgae_jax.configs.build import make_task, make_trainer, seed_keys
+from dgae_jax.configs.config import Config, resolve
+from dgae_jax.learn import devices, iteration
+from dgae_jax.learn.parallel import COMPILER_OPTIONS
+from dgae_jax.learn.rollout import rollout
+from dgae_jax.learn.types import Fitted
+from dgae_jax.physics.native import cores
+from dgae_jax.run import machine
+
+PEER_OF = {"ppo": "PPO", "dppo": "PPO", "trpo": "TRPO", "dtrpo": "TRPO", "a2c": "A2C", "da2c": "A2C"}
 
 
 @dataclass(frozen=True)
 class Arguments:
     """What to measure."""
 
-    seconds: float = 20.0
+    seconds: float = 10.0
     """Time to measure each setting, after compilation [s]."""
+    tasks: tuple[str, ...] = ("hopper", "ant")
+    """Tasks."""
+    algos: tuple[str, ...] = tuple(PEER_OF)
+    """Our algorithms."""
     physics: tuple[str, ...] = ("native", "jax")
     """Engines of ours to measure."""
-    peer: bool = True
-    """Measure stable-baselines3 too."""
+    widths: tuple[int, ...] = (64, 256)
+    """Widths of the two hidden layers; 256 is the paper's [units]."""
+    peers: bool = True
+    """Measure the peers too."""
+    json: Path | None = None
+    """File to keep everything in [path]."""
 
 
 @dataclass(frozen=True)
 class Row:
-    """One measurement."""
+    """One measurement of ours; times are of one iteration."""
 
-    name: str
+    task: str
+    algo: str
+    physics: str
+    width: int
+    worlds: int
+    devices: int
     compile_seconds: float
     steps_per_second: float
+    roofline: float
+    """Steps per second at best."""
+    parts: dict[str, float]
+    """Each part run alone [ms]."""
 
 
-def ours(algo: str, physics: str, seconds: float) -> Row:
+def fastest(f: Callable[[], Any], seconds: float) -> float:
+    """The shortest of the calls that fit into some time, after one that compiles [s]."""
+    jax.block_until_ready(f())
+    ends = [time.perf_counter()]
+    while ends[-1] - ends[0] < seconds:
+        jax.block_until_ready(f())
+        ends.append(time.perf_counter())
+    return min(b - a for a, b in itertools.pairwise(ends))
+
+
+def setting(task: str, algo: str, physics: str, width: int) -> Config:
+    """The defaults of an algorithm on a task, with both networks as wide as asked for."""
+    config = dg.preset("tuned", algo, task)
+    policy, critic = (dataclasses.replace(part, hidden=(width, width)) for part in (config.policy, config.critic))
+    return resolve(dataclasses.replace(config, physics=physics, policy=policy, critic=critic))
+
+
+def ours(config: Config, seconds: float) -> Row:
     """From nothing to the first iteration, then as many iterations as fit, 1 at a time."""
-    config = dataclasses.replace(Config(), algo=algo, physics=physics)
+    count = machine.use_devices(config)
     began = time.perf_counter()
-    trainer = make_trainer(make_task(config), 1)
+    trainer = make_trainer(make_task(config), 1, devices.make_mesh(count))
     state = trainer.init(config, seed_keys(config))
     state, _ = jax.block_until_ready(trainer.dispatch(config, state, 1))
     compiled = time.perf_counter() - began
@@ -55,74 +108,154 @@ def ours(algo: str, physics: str, seconds: float) -> Row:
     while time.perf_counter() - since < seconds:
         state, _ = jax.block_until_ready(trainer.dispatch(config, state, 1))
         iterations += 1
-    speed = iterations * config.samples_per_iteration / (time.perf_counter() - since)
-    return Row(f"dgae_jax {algo}, {physics}, {config.num_envs} worlds", compiled - config.samples_per_iteration / speed, speed)
-
-
-def peer(worlds: int, processes: bool, threads: int, seconds: float) -> Row:
-    """stable-baselines3's PPO for as many iterations as fit, the first left out."""
-    import torch  # pyright: ignore[reportMissingImports]
-    from stable_baselines3 import PPO  # pyright: ignore[reportMissingImports]
-    from stable_baselines3.common.callbacks import BaseCallback  # pyright: ignore[reportMissingImports]
-    from stable_baselines3.common.env_util import make_vec_env  # pyright: ignore[reportMissingImports]
-    from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecNormalize  # pyright: ignore[reportMissingImports]
-
-    class Clock(BaseCallback):
-        ends: list[float] = []  # noqa: RUF012
-
-        def _on_rollout_start(self) -> None:
-            self.ends.append(time.perf_counter())
-
-        def _on_step(self) -> bool:
-            return len(self.ends) < 3 or self.ends[-1] - self.ends[1] < seconds
-
-    torch.set_num_threads(threads)
-
-    def world() -> gymnasium.Env:
-        gymnasium.logger.min_level = gymnasium.logger.ERROR  # that v4 is not the newest version is known
-        return gymnasium.make("Hopper-v4")
-
-    vector = make_vec_env(world, worlds, vec_env_cls=SubprocVecEnv if processes else DummyVecEnv)
-    env, clock = VecNormalize(vector), Clock()
-    clock.ends = []
-    model = PPO(
-        "MlpPolicy", env, n_steps=2048 // worlds, batch_size=64, n_epochs=10, device="cpu",
-        policy_kwargs={"net_arch": {"pi": [64, 64], "vf": [64, 64]}},
+    one = (time.perf_counter() - since) / iterations
+    samples, alone = config.samples_per_iteration, parts_of(config, count, seconds / 10)
+    best = samples / roofline(config)
+    return Row(
+        config.env, str(config.algo), str(config.physics), config.policy.hidden[0], config.num_envs, count, compiled - one,
+        samples / one, best, alone,
     )  # fmt: skip
-    model.learn(10**9, callback=clock)
-    env.close()
-    speed = 2048 * (len(clock.ends) - 2) / (clock.ends[-1] - clock.ends[1])
-    where = "processes" if processes else "one process"
-    return Row(f"stable-baselines3 PPO, {worlds} worlds in {where}, {threads} torch threads", 0.0, speed)
 
 
-def settings(arguments: Arguments) -> Iterator[Callable[[], Row]]:
-    """All measurements, to be made one after the other."""
-    for physics, algo in itertools.product(arguments.physics, ("ppo", "dppo")):
-        yield lambda algo=algo, physics=physics: ours(algo, physics, arguments.seconds)
-    if arguments.peer:
-        threads = sorted({1, os.cpu_count() or 1})
-        for (worlds, processes), count in itertools.product(((1, False), (16, False), (16, True)), threads):
-            yield lambda w=worlds, p=processes, c=count: peer(w, p, c, arguments.seconds)
+class Pieces(NamedTuple):
+    """An iteration taken apart, and what each part is given."""
+
+    rollout: tuple[Callable, tuple]
+    estimate: tuple[Callable, tuple]
+    policy: tuple[Callable, tuple]
+    critic: tuple[Callable, tuple]
+
+
+def taken_apart(config: Config, count: int) -> Pieces:
+    """The parts of the first iteration, the rollout on so many devices."""
+    env, mesh = make_task(config), devices.make_mesh(count)
+    algorithm = dg.make_algorithm(str(config.algo), env, config)
+    init, _ = dg.make_train(algorithm, env, config)
+    key = jax.random.key(0)
+    state = jax.jit(init)(key)
+    keys, actor = jax.random.split(key, (config.horizon, config.num_envs)), Fitted(state.policy.params, state.observations)
+
+    def alone(actor, episodes, keys):
+        return rollout(env, iteration._acting(algorithm, actor), episodes, keys, episode_length=config.episode_length)
+
+    def roll(actor, episodes, keys):
+        with devices.shared_by(mesh):
+            return devices.divided(alone, (None, 0, 1), (0, 1))(actor, episodes, keys)
+
+    def estimate(state, step):
+        return iteration._estimate(algorithm, state, step, step.reward, key, config.gamma, config.lam, iteration.nothing)[0]
+
+    step = jax.device_get(jax.jit(roll)(actor, state.episodes, keys)[1])
+    batch = jax.jit(estimate)(state, step)
+    return Pieces(
+        (roll, (actor, state.episodes, keys)),
+        (estimate, (state, step)),
+        (algorithm.policy_update.step, (key, state.policy, batch)),
+        (algorithm.critic_update.step, (key, state.critic, batch)),
+    )
+
+
+def parts_of(config: Config, count: int, seconds: float) -> dict[str, float]:
+    """Milliseconds of each part when it runs alone; policy and critic on one device each."""
+    found = {}
+    for name, (f, args) in taken_apart(config, count)._asdict().items():
+        part = jax.jit(f, compiler_options=COMPILER_OPTIONS)
+        found[name] = 1e3 * fastest(functools.partial(part, *args), seconds)
+    return found
+
+
+def roofline(config: Config) -> float:
+    """Seconds of an iteration on all cores if there were nothing but physics, matrix products and residuals."""
+    flops = sum(float(counted(f, "cpu")(*args)[1].flops) for f, args in _without_physics(config))
+    products = flops / product_rate()
+    quantiles, fit = config.critic.quantiles, config.critic
+    residuals = (fit.epochs or 0) * config.samples_per_iteration * quantiles**2 if quantiles else 0
+    return c_seconds(config.env, config.num_envs, config.horizon) + products + residuals / (cores() * residual_rate(quantiles or 1))
+
+
+def _without_physics(config: Config) -> list[tuple[Callable, tuple]]:
+    """Acting on all samples, estimating, fitting."""
+    pieces = taken_apart(dataclasses.replace(config, physics="native"), 1)
+    actor, episodes, _ = pieces.rollout[1]
+    env = make_task(config)
+    act = iteration._acting(dg.make_algorithm(str(config.algo), env, config), actor)
+    keys, obs = jax.random.split(jax.random.key(0), config.num_envs), episodes.env.obs
+    acting = lambda: jax.lax.scan(lambda c, _: (c, act(keys, obs)[0]), 0, None, length=config.horizon)[1]  # noqa: E731
+    return [(acting, ()), *pieces[1:]]
+
+
+@functools.cache
+def c_seconds(task: str, worlds: int, horizon: int) -> float:
+    """C MuJoCo alone, on all cores, under random controls [s]."""
+    env: Any = dg.make_env(task, physics="native")
+    model, rng = env._physics.model, np.random.default_rng(0)
+    batch = Batch(model, worlds, min(cores(), worlds))
+    batch.bind("qpos")[:] = model.qpos0
+
+    def run() -> None:
+        for _ in range(horizon):
+            batch.bind("ctrl")[:] = rng.uniform(-1, 1, (worlds, model.nu))
+            batch.step(nstep=env.FRAME_SKIP)
+
+    return fastest(run, 2.0)
+
+
+@functools.cache
+def product_rate(size: int = 512) -> float:
+    """Floating-point operations per second of matrix products, which XLA divides between all cores."""
+    x = jnp.ones((size, size))
+    many = jax.jit(lambda x: jax.lax.fori_loop(0, 20, lambda i, y: jnp.tanh(y[:1]) + x @ y, x))
+    return 20 * 2 * size**3 / fastest(lambda: many(x), 2.0)
+
+
+@functools.cache
+def residual_rate(quantiles: int) -> float:
+    """Residuals per second of the quantile-Huber loss with its derivatives on one core."""
+    x = jax.random.normal(jax.random.key(0), (64, quantiles))
+    slopes = jax.grad(lambda z, t: dg.quantile_huber_loss(z, t).sum())
+    many = jax.jit(lambda x: jax.lax.fori_loop(0, 100, lambda i, y: y - 1e-3 * slopes(y, x), 2 * x), compiler_options=COMPILER_OPTIONS)
+    return 100 * 64 * quantiles**2 / fastest(lambda: many(x), 1.0)
+
+
+def settings(arguments: Arguments) -> Iterator[Config]:
+    """All of ours, one after the other."""
+    for task, width, physics, algo in itertools.product(arguments.tasks, arguments.widths, arguments.physics, arguments.algos):
+        yield setting(task, algo, physics, width)
 
 
 def main() -> None:
-    """Print a row per setting, then our speed over the peer's fastest."""
-    arguments = parse(Arguments, "Training throughput on Hopper.")
+    """Print the peers, then a row of ours each, over the fastest peer and over the roofline."""
+    arguments = parse(Arguments, "Training throughput.")
     jax.config.update("jax_enable_compilation_cache", False)
-    print(f"{os.cpu_count()} cores, {jax.devices()[0].device_kind}, jax {jax.__version__}")
-    print(f"{'setting':66s} {'compile s':>9s} {'steps/s':>9s}")
+    jax.config.update("jax_num_cpu_devices", cores())
+    others = []
+    if arguments.peers:
+        for task, width in itertools.product(arguments.tasks, arguments.widths):
+            for measured in peers.all_of(task, width, arguments.seconds, sorted({PEER_OF[algo] for algo in arguments.algos})):
+                others.append(measured)
+                print(f"{measured.name:76s} {measured.steps_per_second:9,.0f}", flush=True)
+    print(f"{cores()} cores, {jax.devices()[0].device_kind}, jax {jax.__version__}; milliseconds of each part alone")
+    head = f"{'task':7s} {'algo':5s} {'physics':7s} {'width':>5s} {'compile s':>9s} {'steps/s':>9s} {'/ peer':>7s} {'/ roofline':>10s}"
+    print(head, *(f"{name:>9s}" for name in Pieces._fields))
     rows = []
-    for measure in settings(arguments):
-        row = measure()
+    for config in settings(arguments):
+        row = ours(config, arguments.seconds)
         rows.append(row)
-        print(f"{row.name:66s} {row.compile_seconds:9.1f} {row.steps_per_second:9,.0f}", flush=True)
-    fastest = max((row for row in rows if row.name.startswith("stable")), key=lambda row: row.steps_per_second, default=None)
-    if fastest:
-        print(f"over the fastest of stable-baselines3 ({fastest.steps_per_second:,.0f} steps/s):")
-        for row in rows:
-            if row is not fastest and not row.name.startswith("stable"):
-                print(f"{row.name:66s} {row.steps_per_second / fastest.steps_per_second:19.1f} ×")
+        rival = max(
+            (o.steps_per_second for o in others if (o.task, o.width, o.algo) == (row.task, row.width, PEER_OF[row.algo])), default=0
+        )
+        over = f"{row.steps_per_second / rival:7.1f}" if rival else f"{'':7s}"
+        print(
+            f"{row.task:7s} {row.algo:5s} {row.physics:7s} {row.width:5d} {row.compile_seconds:9.1f} {row.steps_per_second:9,.0f} {over}"
+            f" {row.steps_per_second / row.roofline:10.2f}",
+            *(f"{ms:9.1f}" for ms in row.parts.values()),
+            flush=True,
+        )
+    if arguments.json:
+        facts = {**machine.facts(), "jax": jax.__version__}
+        found = {"machine": facts, "ours": [dataclasses.asdict(r) for r in rows], "peers": [dataclasses.asdict(o) for o in others]}
+        arguments.json.parent.mkdir(parents=True, exist_ok=True)
+        arguments.json.write_text(json.dumps(found, indent=1) + "\n")
 
 
 if __name__ == "__main__":

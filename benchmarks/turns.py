@@ -7,13 +7,15 @@ On an accelerator a turn costs the launch of its kernels, and one whose loop goe
 by carrying a counter through every loop of the traced program. Worlds begin at random poses and act at random.
 """
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 import dgae_jax as dg
 from dgae_jax.cli.arguments import parse
@@ -36,63 +38,82 @@ class Arguments:
     """Environment steps, of which the mean is printed [steps]."""
 
 
-def counted(f: Callable) -> Callable:
-    """`counted(f)(*args) -> (f(*args), turns of loops of known length, turns of other loops)`, as an accelerator would run it."""
+class Counts(NamedTuple):
+    """What a program does in sequence, and how much it multiplies."""
 
-    def count(*args: Any) -> tuple[Any, jax.Array, jax.Array]:
+    known: Any
+    """Turns of loops of known length."""
+    asked: Any
+    """Turns of other loops."""
+    flops: Any
+    """Floating-point operations of matrix products, 2 per multiplication."""
+
+
+NONE = Counts(np.float32(0), np.float32(0), np.float32(0))
+
+
+def counted(f: Callable, platform: str | None = None) -> Callable:
+    """`counted(f)(*args) -> (f(*args), Counts)`, as `platform` would run it, by default an accelerator."""
+
+    def count(*args: Any) -> tuple[Any, Counts]:
         program, shape = jax.make_jaxpr(f, return_shape=True)(*args)
-        out, (known, other) = _run(program, jax.tree.leaves(args))
-        return jax.tree.unflatten(jax.tree.structure(shape), out), known, other
+        out, counts = _run(program, jax.tree.leaves(args), platform)
+        return jax.tree.unflatten(jax.tree.structure(shape), out), counts
 
     return jax.jit(count)
 
 
-def _run(program: Any, args: list) -> tuple[list, tuple[jax.Array, jax.Array]]:
-    """The program's outputs and its turns."""
+def _run(program: Any, args: list, platform: str | None) -> tuple[list, Counts]:
+    """The program's outputs and what it does."""
     jaxpr, consts = (program.jaxpr, program.consts) if hasattr(program, "consts") else (program, [])
-    values = dict(zip([*jaxpr.constvars, *jaxpr.invars], [*consts, *args], strict=True))
-    turns = jnp.int32(0), jnp.int32(0)
+    values, counts = dict(zip([*jaxpr.constvars, *jaxpr.invars], [*consts, *args], strict=True)), NONE
     for eqn in jaxpr.eqns:
-        given = [x.val if hasattr(x, "val") else values[x] for x in eqn.invars]
-        out, more = _evaluate(eqn, given)
+        out, more = _evaluate(eqn, [x.val if hasattr(x, "val") else values[x] for x in eqn.invars], platform)
         values.update(zip(eqn.outvars, out, strict=True))
-        turns = _add(turns, more)
-    return [x.val if hasattr(x, "val") else values[x] for x in jaxpr.outvars], turns
+        counts = _add(counts, more)
+    return [x.val if hasattr(x, "val") else values[x] for x in jaxpr.outvars], counts
 
 
-def _evaluate(eqn: Any, args: list) -> tuple[list, tuple]:
-    """One operation's outputs, and the turns of its loops."""
-    name, how, none = eqn.primitive.name, eqn.params, (jnp.int32(0), jnp.int32(0))
+def _evaluate(eqn: Any, args: list, platform: str | None) -> tuple[list, Counts]:
+    """One operation's outputs, and what it does."""
+    name, how = eqn.primitive.name, eqn.params
     if name == "platform_index":
-        return [how["platforms"].index(None)], none  # the branch for all but the CPU
+        chosen = [i for i, names in enumerate(how["platforms"]) if names and platform in names]
+        return [chosen[0] if chosen else how["platforms"].index(None)], NONE
     if name == "custom_linear_solve":  # conjugate gradient
         lengths = how["const_lengths"]
         before = lengths.matvec + lengths.vecmat
-        return _run(how["jaxprs"].solve, args[before : before + lengths.solve] + args[sum(lengths) :])
+        return _run(how["jaxprs"].solve, args[before : before + lengths.solve] + args[sum(lengths) :], platform)
     if name in CALLS:
-        return _run(how[CALLS[name]], args)
+        return _run(how[CALLS[name]], args, platform)
     if name == "cond":
-        return jax.lax.switch(args[0], [lambda *x, b=b: _run(b, [*x]) for b in how["branches"]], *args[1:])
+        return jax.lax.switch(args[0], [lambda *x, b=b: _run(b, [*x], platform) for b in how["branches"]], *args[1:])
     if name == "scan":
         fixed, carry, xs = _split(args, how["num_consts"], how["num_carry"])
 
         def turn(state, x):
-            out, more = _run(how["jaxpr"], [*fixed, *state[0], *x])
-            return (out[: len(carry)], _add(state[1], more, (1, 0))), out[len(carry) :]
+            out, more = _run(how["jaxpr"], [*fixed, *state[0], *x], platform)
+            return (out[: len(carry)], _add(state[1], more)), out[len(carry) :]
 
-        (carry, turns), ys = jax.lax.scan(turn, (carry, none), xs, length=how["length"], reverse=how["reverse"])
-        skipped = how["length"] - -(-how["length"] // how["unroll"])  # turns written out in others
-        return [*carry, *ys], (turns[0] - skipped, turns[1])
+        (carry, counts), ys = jax.lax.scan(turn, (carry, NONE), xs, length=how["length"], reverse=how["reverse"])
+        return [*carry, *ys], counts._replace(known=counts.known + -(-how["length"] // how["unroll"]))
     if name == "while":
         asked, fixed, carry = _split(args, how["cond_nconsts"], how["body_nconsts"])
 
         def repeat(state):
-            out, more = _run(how["body_jaxpr"], [*fixed, *state[0]])
-            return out, _add(state[1], more, (0, 1))
+            out, more = _run(how["body_jaxpr"], [*fixed, *state[0]], platform)
+            return out, _add(state[1], more)._replace(asked=state[1].asked + more.asked + 1)
 
-        return jax.lax.while_loop(lambda s: _run(how["cond_jaxpr"], [*asked, *s[0]])[0][0], repeat, (carry, none))
+        return jax.lax.while_loop(lambda s: _run(how["cond_jaxpr"], [*asked, *s[0]], platform)[0][0], repeat, (carry, NONE))
     out = eqn.primitive.bind(*args, **how)
-    return out if eqn.primitive.multiple_results else [out], none
+    return out if eqn.primitive.multiple_results else [out], NONE._replace(flops=jnp.float32(_flops(eqn)))
+
+
+def _flops(eqn: Any) -> int:
+    if eqn.primitive.name != "dot_general":
+        return 0
+    (contracted, _), _ = eqn.params["dimension_numbers"]
+    return 2 * math.prod(eqn.outvars[0].aval.shape) * math.prod(eqn.invars[0].aval.shape[i] for i in contracted)
 
 
 def _split(items: list, *sizes: int) -> tuple[list, ...]:
@@ -101,21 +122,21 @@ def _split(items: list, *sizes: int) -> tuple[list, ...]:
     return items[:a], items[a : a + b], items[a + b :]
 
 
-def _add(*counts: tuple) -> tuple[jax.Array, jax.Array]:
-    return tuple(jnp.int32(sum(column)) for column in zip(*counts, strict=True))  # pyright: ignore[reportReturnType]
+def _add(a: Counts, b: Counts) -> Counts:
+    return jax.tree.map(jnp.add, a, b)
 
 
 def of_step(name: str, worlds: int, steps: int) -> list[float]:
     """Mean turns of one environment step of all worlds."""
     env: Any = dg.make_env(name, physics="jax")
     low, high = env.action_range
-    step, key, total = counted(jax.vmap(env.step)), jax.random.key(0), jnp.zeros(2)
+    step, key, total = counted(jax.vmap(env.step)), jax.random.key(0), NONE
     state = jax.jit(jax.vmap(env.reset))(jax.random.split(key, worlds))
     for k in jax.random.split(key, steps):
         action = jax.random.uniform(k, (worlds, env.action_size), minval=low, maxval=high)
-        state, *turns = step(state, action)
-        total += jnp.array(turns)
-    return [float(x) / steps for x in total]
+        state, counts = step(state, action)
+        total = _add(total, counts)
+    return [float(total.known) / steps, float(total.asked) / steps]
 
 
 def of_update(algo: str) -> list[list[int]]:
@@ -132,8 +153,8 @@ def of_update(algo: str) -> list[list[int]]:
     found = []
     for network, update in ((algorithm.policy, algorithm.policy_update), (algorithm.critic, algorithm.critic_update)):
         params = network.init(key)
-        _, *turns = counted(partial(update.step, key))(Fit(params, update.init(params)), batch)
-        found.append([int(x) for x in turns])
+        _, counts = counted(partial(update.step, key))(Fit(params, update.init(params)), batch)
+        found.append([int(counts.known), int(counts.asked)])
     return found
 
 

@@ -82,11 +82,12 @@ def _advance(episodes: Episodes, after: Any, step: Transition, fresh: Episodes) 
 
 
 def rollout(env: Env, act: Act, episodes: Episodes, keys: Key[Array, "T N"], *, episode_length: int) -> tuple[Episodes, Transition]:
-    """T steps in every world, each with its own key: how worlds are divided over devices changes nothing. The action is clipped to the actuators' range before it acts, not in the record.
+    """T steps in every world, each with a key of its own, so that it does not matter how worlds are divided over devices.
 
-    An episode that ends is followed by a fresh random one; `next_obs` stays the observation in which it ended. A world
-    whose action, state, reward or observation turns non-finite is quarantined: its episode ends there as terminated
-    with reward 0, the step is marked as not `valid`, and only finite numbers leave this function.
+    The action is clipped to the actuators' range before it acts, not in the record. An episode that ends is followed by a fresh
+    random one; `next_obs` stays the observation in which it ended. A world whose action, state, reward or observation turns
+    non-finite is quarantined: its episode ends there as terminated with reward 0, the step is marked as not `valid`, and only
+    finite numbers leave this function.
     """
     low, high = env.action_range
 

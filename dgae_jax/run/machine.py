@@ -31,7 +31,7 @@ def use_devices(config: Config, wanted: int | None = None) -> int:
     _start(config)
     there = jax.device_count()
     if wanted is None:
-        return _dividing(config, there, 1)
+        return _dividing(config, there, WORLDS_PER_CORE if jax.default_backend() == "cpu" else 1)
     if wanted > there:
         raise invalid("devices", wanted, f"at most {there}, which JAX has here (a CPU is divided before JAX starts)")
     if _dividing(config, wanted, 1) != wanted:

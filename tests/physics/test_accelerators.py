@@ -1,6 +1,7 @@
 """The form of the physics for accelerators: the same solution, in few turns of loops, which cost a launch each there."""
 
 import jax
+import jax.numpy as jnp
 import pytest
 from numpy.testing import assert_allclose
 
@@ -21,10 +22,16 @@ def test_an_environment_step_turns_few_loops(name, most):
     assert sum(of_step(name, 256, 1)) < most
 
 
-def test_turns_are_counted_through_nested_loops_calls_and_branches():
+def test_turns_and_products_are_counted_through_nested_loops_calls_and_branches():
     def program(x):
         x = jax.lax.scan(lambda c, _: (jax.lax.fori_loop(0, 3, lambda i, y: y + 1, c), None), x, length=5)[0]  # 5 · (1 + 3)
         x = jax.lax.while_loop(lambda y: y < 22, lambda y: y + 2, x)  # from 15: 4
         return jax.lax.cond(x > 0, jax.jit(lambda y: jax.lax.fori_loop(0, 7, lambda i, z: z + 1, y)), lambda y: y, x)  # 7
 
-    assert [int(n) for n in counted(program)(0)] == [30, 20 + 7, 4]
+    out, counts = counted(program)(0)
+    assert (int(out), int(counts.known), int(counts.asked), int(counts.flops)) == (30, 20 + 7, 4, 0)
+
+    def products(a, b):
+        return jax.lax.fori_loop(0, 6, lambda i, x: jnp.tanh(a @ x @ b), jnp.ones((3, 2)))
+
+    assert int(counted(products)(jnp.ones((3, 3)), jnp.ones((2, 2)))[1].flops) == 6 * 2 * (3 * 3 * 2 + 3 * 2 * 2)

@@ -1,0 +1,77 @@
+"""Training steps per second of stable-baselines3 and sb3-contrib, in every layout that may be their fastest."""
+
+import itertools
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import gymnasium
+
+from dgae_jax.envs.registry import TASKS
+from dgae_jax.physics.native import cores
+
+
+@dataclass(frozen=True)
+class Peer:
+    """One measurement of another library."""
+
+    task: str
+    algo: str
+    width: int
+    name: str
+    steps_per_second: float
+
+
+LAYOUTS = ((1, False), (8, False), (16, False), (8, True), (16, True))
+"""Worlds, and whether each has a process of its own."""
+
+
+def all_of(task: str, width: int, seconds: float, algos: list[str]) -> Iterator[Peer]:
+    """Every algorithm in every layout, on one thread of torch and on as many as there are cores."""
+    for algo, (worlds, processes), threads in itertools.product(algos, LAYOUTS, sorted({1, cores()})):
+        speed = steps_per_second(task, algo, width, worlds, processes, threads, seconds)
+        where = "processes" if processes else "one process"
+        name = f"stable-baselines3 {algo}, {task}, 2 × {width}, {worlds} worlds in {where}, {threads} threads"
+        yield Peer(task, algo, width, name, speed)
+
+
+def steps_per_second(task: str, algo: str, width: int, worlds: int, processes: bool, threads: int, seconds: float) -> float:
+    """As many iterations as fit, the first left out."""
+    import torch  # pyright: ignore[reportMissingImports]
+    from stable_baselines3.common.callbacks import BaseCallback  # pyright: ignore[reportMissingImports]
+    from stable_baselines3.common.env_util import make_vec_env  # pyright: ignore[reportMissingImports]
+    from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecNormalize  # pyright: ignore[reportMissingImports]
+
+    ends: list[float] = []
+
+    class Clock(BaseCallback):
+        def _on_rollout_start(self) -> None:
+            ends.append(time.perf_counter())
+
+        def _on_step(self) -> bool:
+            return len(ends) < 3 or ends[-1] - ends[1] < seconds
+
+    torch.set_num_threads(threads)
+
+    def world() -> gymnasium.Env:
+        gymnasium.logger.min_level = gymnasium.logger.ERROR  # that v4 is not the newest version is known
+        return gymnasium.make(TASKS[task].referees["v4"])
+
+    env = VecNormalize(make_vec_env(world, worlds, vec_env_cls=SubprocVecEnv if processes else DummyVecEnv))
+    _model(algo, env, width, 2048 // worlds).learn(10**9, callback=Clock())
+    env.close()
+    return 2048 * (len(ends) - 2) / (ends[-1] - ends[1])
+
+
+def _model(algo: str, env: Any, width: int, steps: int) -> Any:
+    """The library's own algorithm with our samples per iteration, and PPO and TRPO with our minibatches and epochs."""
+    from sb3_contrib import TRPO  # pyright: ignore[reportMissingImports]
+    from stable_baselines3 import A2C, PPO  # pyright: ignore[reportMissingImports]
+
+    common = {"n_steps": steps, "device": "cpu", "policy_kwargs": {"net_arch": {"pi": [width, width], "vf": [width, width]}}}
+    if algo == "A2C":
+        return A2C("MlpPolicy", env, **common)
+    if algo == "TRPO":
+        return TRPO("MlpPolicy", env, batch_size=64, n_critic_updates=10, cg_max_steps=10, **common)
+    return PPO("MlpPolicy", env, batch_size=64, n_epochs=10, **common)
