@@ -14,6 +14,7 @@ import dataclasses
 import functools
 import itertools
 import json
+import multiprocessing
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -98,6 +99,7 @@ def setting(task: str, algo: str, physics: str, width: int) -> Config:
 
 def ours(config: Config, seconds: float) -> Row:
     """From nothing to the first iteration, then as many iterations as fit, 1 at a time."""
+    jax.config.update("jax_enable_compilation_cache", False)
     count = machine.use_devices(config)
     began = time.perf_counter()
     trainer = make_trainer(make_task(config), 1, devices.make_mesh(count))
@@ -226,8 +228,6 @@ def settings(arguments: Arguments) -> Iterator[Config]:
 def main() -> None:
     """Print the peers, then a row of ours each, over the fastest peer and over the roofline."""
     arguments = parse(Arguments, "Training throughput.")
-    jax.config.update("jax_enable_compilation_cache", False)
-    jax.config.update("jax_num_cpu_devices", cores())
     others = []
     if arguments.peers:
         for task, width in itertools.product(arguments.tasks, arguments.widths):
@@ -239,7 +239,8 @@ def main() -> None:
     print(head, *(f"{name:>9s}" for name in Pieces._fields))
     rows = []
     for config in settings(arguments):
-        row = ours(config, arguments.seconds)
+        with multiprocessing.get_context("spawn").Pool(1) as process:  # JAX starts with as many devices as the run has
+            row = process.apply(ours, (config, arguments.seconds))
         rows.append(row)
         rival = max(
             (o.steps_per_second for o in others if (o.task, o.width, o.algo) == (row.task, row.width, PEER_OF[row.algo])), default=0
