@@ -27,16 +27,16 @@ LAYOUTS = ((1, False), (8, False), (16, False), (8, True), (16, True))
 """Worlds, and whether each has a process of its own."""
 
 
-def all_of(task: str, width: int, seconds: float, algos: list[str]) -> Iterator[Peer]:
-    """Every algorithm in every layout, on one thread of torch and on as many as there are cores."""
-    for algo, (worlds, processes), threads in itertools.product(algos, LAYOUTS, sorted({1, cores()})):
-        speed = steps_per_second(task, algo, width, worlds, processes, threads, seconds)
+def all_of(task: str, width: int, seconds: float, samples: dict[str, int]) -> Iterator[Peer]:
+    """Every algorithm, with its samples per iteration, in every layout, on one thread of torch and on as many as there are cores."""
+    for algo, (worlds, processes), threads in itertools.product(samples, LAYOUTS, sorted({1, cores()})):
+        speed = steps_per_second(task, algo, width, worlds, processes, threads, samples[algo], seconds)
         where = "processes" if processes else "one process"
         name = f"stable-baselines3 {algo}, {task}, 2 × {width}, {worlds} worlds in {where}, {threads} threads"
         yield Peer(task, algo, width, name, speed)
 
 
-def steps_per_second(task: str, algo: str, width: int, worlds: int, processes: bool, threads: int, seconds: float) -> float:
+def steps_per_second(task: str, algo: str, width: int, worlds: int, processes: bool, threads: int, samples: int, seconds: float) -> float:
     """As many iterations as fit, the first left out."""
     import torch  # pyright: ignore[reportMissingImports]
     from stable_baselines3.common.callbacks import BaseCallback  # pyright: ignore[reportMissingImports]
@@ -59,9 +59,9 @@ def steps_per_second(task: str, algo: str, width: int, worlds: int, processes: b
         return gymnasium.make(TASKS[task].referees["v4"])
 
     env = VecNormalize(make_vec_env(world, worlds, vec_env_cls=SubprocVecEnv if processes else DummyVecEnv))
-    _model(algo, env, width, 2048 // worlds).learn(10**9, callback=Clock())
+    _model(algo, env, width, samples // worlds).learn(10**9, callback=Clock())
     env.close()
-    return 2048 * (len(ends) - 2) / (ends[-1] - ends[1])
+    return samples // worlds * worlds * (len(ends) - 2) / (ends[-1] - ends[1])
 
 
 def _model(algo: str, env: Any, width: int, steps: int) -> Any:

@@ -13,6 +13,7 @@ import time
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
@@ -25,6 +26,8 @@ from mujoco.batch import Batch
 import dgae_jax as dg
 from dgae_jax.cli.arguments import parse
 from dgae_jax.envs.registry import TASKS
+from dgae_jax.learn import devices
+from dgae_jax.learn.parallel import COMPILER_OPTIONS
 from dgae_jax.physics.registry import ENGINES
 from dgae_jax.run import directory
 
@@ -49,10 +52,12 @@ class Arguments:
     """Device of the engines in JAX."""
     x64: bool = False
     """Compute in float64; mjx-warp stays in float32."""
+    devices: int = 1
+    """Devices that divide the worlds of engines in JAX, of a CPU its cores; then speeds are by the clock [devices]."""
 
     def clock(self) -> float:
         """On a CPU the seconds that this process used, which on one core other programs disturb least."""
-        return time.process_time() if self.device == "cpu" else time.perf_counter()
+        return time.process_time() if self.device == "cpu" and self.devices == 1 else time.perf_counter()
 
 
 def steps_per_second(run: Callable[[int], Any], worlds: int, arguments: Arguments) -> float:
@@ -88,13 +93,17 @@ def engine_speed(name: str, engine: str, worlds: int, arguments: Arguments) -> t
     env: Any = dg.make_env(name, physics=engine)
     physics = env._physics
 
-    @jax.jit
-    def run(state, key, count):
+    def some(state, key, count):
         def one(i, state):
-            ctrl = jax.random.uniform(jax.random.fold_in(key, i), (worlds, physics.model.nu), minval=-1, maxval=1)
+            ctrl = jax.random.uniform(jax.random.fold_in(key, i), (len(state.qpos), physics.model.nu), minval=-1, maxval=1)
             return jax.vmap(physics.step)(state, ctrl)
 
         return jax.lax.fori_loop(0, count, one, state)
+
+    @partial(jax.jit, compiler_options=COMPILER_OPTIONS)
+    def run(state, key, count):
+        with devices.shared_by(devices.make_mesh(arguments.devices)):
+            return devices.divided(some, (0, None, None), 0)(state, key, count)
 
     qpos = jnp.broadcast_to(jnp.asarray(physics.model.qpos0), (worlds, physics.model.nq))
     state = physics.at_pose(qpos, jnp.zeros((worlds, physics.model.nv)))
@@ -193,6 +202,7 @@ def main() -> None:
     jax.config.update("jax_enable_compilation_cache", False)
     jax.config.update("jax_platforms", {"cpu": "cpu", "gpu": "cuda"}[arguments.device])
     jax.config.update("jax_enable_x64", arguments.x64)
+    jax.config.update("jax_num_cpu_devices", arguments.devices)
     warnings.simplefilter("ignore")
     print(f"{jax.devices()[0].device_kind}, jax {jax.__version__}; environment steps per second")
     speeds(arguments)

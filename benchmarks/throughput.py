@@ -2,8 +2,7 @@
 
     pip install -e ".[bench]" && python benchmarks/throughput.py --json benchmarks/results/throughput.json
 
-Everyone trains on the same task with the same network (tanh), samples per iteration (2,048), epochs, minibatches and
-normalisation. stable-baselines3 and sb3-contrib run with 1, 8 and 16 worlds in one process, 8 and 16 in processes, on one and
+Everyone trains on the same task with the same network (tanh), samples per iteration, epochs, minibatches and normalisation. stable-baselines3 and sb3-contrib run with 1, 8 and 16 worlds in one process, 8 and 16 in processes, on one and
 on all threads of torch; the fastest setting is the one to compare with. The roofline is the time of an iteration in which all
 cores do nothing but simulate (C MuJoCo), multiply matrices (the operations that the program counts, at the highest rate
 measured here) and evaluate the residuals of the quantile-Huber loss (at the rate measured here). Nothing else should run on
@@ -26,6 +25,7 @@ import jax.numpy as jnp
 import numpy as np
 import peers
 from mujoco.batch import Batch
+from table import PEER_OF
 from turns import counted
 
 import dgae_jax as dg
@@ -38,8 +38,7 @@ from dgae_jax.learn.rollout import rollout
 from dgae_jax.learn.types import Fitted
 from dgae_jax.physics.native import cores
 from dgae_jax.run import machine
-
-PEER_OF = {"ppo": "PPO", "dppo": "PPO", "trpo": "TRPO", "dtrpo": "TRPO", "a2c": "A2C", "da2c": "A2C"}
+from dgae_jax.run.options import RunOptions
 
 
 @dataclass(frozen=True)
@@ -100,7 +99,7 @@ def setting(task: str, algo: str, physics: str, width: int) -> Config:
 def ours(config: Config, seconds: float) -> Row:
     """From nothing to the first iteration, then as many iterations as fit, 1 at a time."""
     jax.config.update("jax_enable_compilation_cache", False)
-    count = machine.use_devices(config)
+    count = machine.use_devices(config, RunOptions())
     began = time.perf_counter()
     trainer = make_trainer(make_task(config), 1, devices.make_mesh(count))
     state = trainer.init(config, seed_keys(config))
@@ -231,7 +230,8 @@ def main() -> None:
     others = []
     if arguments.peers:
         for task, width in itertools.product(arguments.tasks, arguments.widths):
-            for measured in peers.all_of(task, width, arguments.seconds, sorted({PEER_OF[algo] for algo in arguments.algos})):
+            samples = {PEER_OF[algo]: setting(task, algo, "native", width).samples_per_iteration for algo in arguments.algos}
+            for measured in peers.all_of(task, width, arguments.seconds, samples):
                 others.append(measured)
                 print(f"{measured.name:76s} {measured.steps_per_second:9,.0f}", flush=True)
     print(f"{cores()} cores, {jax.devices()[0].device_kind}, jax {jax.__version__}; milliseconds of each part alone")

@@ -1,9 +1,11 @@
 """What the documents print is run as it stands there."""
 
+import json
 import re
 
 import pytest
 
+from benchmarks.table import table
 from dgae_jax.configs.algorithms import TABLE
 from dgae_jax.configs.parts import UPDATES
 from dgae_jax.maths.risk import METRICS
@@ -40,3 +42,9 @@ def test_links_between_documents_lead_somewhere(path):
 def test_modules_that_documents_name_exist(path):
     for name in re.findall(r"`((?:dgae_jax|experiments|benchmarks|tests|docs)/[\w/]+\.\w+)`", path.read_text()):
         assert (ROOT / name).exists(), name
+
+
+@pytest.mark.parametrize("path", DOCUMENTS, ids=lambda path: path.name)
+def test_a_table_of_measurements_is_what_its_command_prints(path):
+    for file, block in re.findall(r"<!-- python benchmarks/table\.py (\S+) -->\n(.*?)\n<!-- -->", path.read_text(), re.DOTALL):
+        assert block == table(json.loads((ROOT / file).read_text()))

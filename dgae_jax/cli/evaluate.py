@@ -75,7 +75,7 @@ def _evaluate(arguments: Arguments) -> int:
     out = arguments.out or evaluation.default_path(arguments.run_dir, engine, arguments.checkpoint)
     if not os.access(out.absolute().parent, os.W_OK):
         raise invalid("out", out, "a file that can be written")
-    machine.use_devices(config, 1)
+    machine.use_devices(config, RunOptions(devices=1, num_processes=1))
     machine.use_cache(arguments.cache_dir)
     how = {"which": arguments.checkpoint, "engine": engine, "episodes": arguments.episodes, "seed": arguments.seed}
     with Reporter() as reporter:

@@ -19,7 +19,7 @@ import numpy as np
 
 from dgae_jax.configs.config import Config, ConfigError
 from dgae_jax.configs.serial import from_dict, to_dict
-from dgae_jax.run import files
+from dgae_jax.run import files, hosts
 
 T = TypeVar("T")
 
@@ -44,7 +44,7 @@ class NotFiniteError(CheckpointError):
 
 def arrays_of(tree: Any) -> dict[str, np.ndarray]:
     """A copy of the tree's arrays by name, as `save` takes them."""
-    return {name: np.array(x) for name, x in sorted(_plain(tree).items())}
+    return {name: np.array(hosts.whole(x)) for name, x in sorted(_plain(tree).items())}
 
 
 def save(directory: Path, config: Config, arrays: dict[str, np.ndarray], steps: int, keep: int = 3, best: int | None = None) -> Path:

@@ -12,7 +12,7 @@ from dgae_jax.configs.memory import check_memory
 from dgae_jax.configs.serial import MAY_CHANGE, differences
 from dgae_jax.configs.validation import validate
 from dgae_jax.learn.types import TrainState
-from dgae_jax.run import checkpoint, compiling, directory, machine, manifest, restore, terminal
+from dgae_jax.run import checkpoint, compiling, directory, hosts, machine, manifest, restore, terminal
 from dgae_jax.run.evaluations import EvaluationsFile
 from dgae_jax.run.options import RunOptions, validate_options
 from dgae_jax.run.summary import describe
@@ -34,10 +34,10 @@ def start(config: Config, options: RunOptions) -> Finished:
     ends early.
     """
     config, options = _prepared(config, options)
-    run_dir = options.run_dir or directory.default_path(config)
-    directory.create(run_dir, config, options)
-    with directory.locked(run_dir):
-        return Finished(run_to_end(config, options, run_dir, None), run_dir)
+    with hosts.writing(options.run_dir or directory.default_path(config)) as run_dir:
+        directory.create(run_dir, config, options)
+        with directory.locked(run_dir):
+            return Finished(run_to_end(config, options, run_dir, None), run_dir)
 
 
 def go_on(config: Config, options: RunOptions) -> Finished:
@@ -47,17 +47,17 @@ def go_on(config: Config, options: RunOptions) -> Finished:
     or for another machine or version; CheckpointError if no checkpoint can be loaded.
     """
     config, options = _prepared(config, options)
-    run_dir = options.resume
-    assert run_dir is not None
-    _compare(config, directory.read_config(run_dir), run_dir, options)
-    with directory.locked(run_dir):
+    assert options.resume is not None
+    _compare(config, directory.read_config(options.resume), options.resume, options)
+    with hosts.writing(options.resume) as run_dir, directory.locked(run_dir):
         return Finished(run_to_end(config, options, run_dir, _last_state(run_dir, config)), run_dir)
 
 
 def go_on_or_start(config: Config, options: RunOptions) -> Finished:
     """`go_on` in `options.run_dir` if a run was begun there, `start` otherwise; raises as they do."""
     validate_options(options)
-    if options.run_dir is not None and directory.has_begun(options.run_dir):
+    hosts.join(options)
+    if options.run_dir is not None and hosts.first(directory.has_begun(options.run_dir)):
         return go_on(config, dataclasses.replace(options, resume=options.run_dir, run_dir=None, resume_or_start=False))
     return start(config, options)
 
@@ -94,7 +94,7 @@ def _prepared(config: Config, options: RunOptions) -> tuple[Config, RunOptions]:
     """Configuration and options in full, after a look at everything that can be seen before work begins."""
     config = validate(config)
     validate_options(options)
-    devices = machine.use_devices(config, options.devices)
+    devices = machine.use_devices(config, options)
     machine.use_cache(options.cache_dir)
     check_memory(config, make_task(config), machine.memory())
     return config, dataclasses.replace(options, devices=devices)

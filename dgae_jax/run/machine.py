@@ -11,7 +11,8 @@ import jax
 from dgae_jax.configs.config import Config, ConfigError, invalid
 from dgae_jax.physics.native import cores
 from dgae_jax.physics.registry import ENGINES
-from dgae_jax.run import terminal
+from dgae_jax.run import hosts, terminal
+from dgae_jax.run.options import RunOptions
 
 _SETTINGS = ("jax_enable_x64", "jax_default_prng_impl", "jax_threefry_partitionable", "jax_default_matmul_precision")
 """Of JAX, which the environment may change and on which the bits depend."""
@@ -21,15 +22,19 @@ WORLDS_PER_CORE = 16
 """Fewer are stepped no faster: at that number every operation takes as long as its start."""
 
 
-def use_devices(config: Config, wanted: int | None = None) -> int:
-    """Start JAX, and the number of its devices that share a run.
+def use_devices(config: Config, options: RunOptions) -> int:
+    """Start JAX, together with the other processes of the run, and the number of devices that share it.
 
-    Raises ConfigError if there is none of the kind asked for, or `wanted` are not there or do not divide worlds or seeds.
+    Raises ConfigError if there is none of the kind asked for, or they are not there or do not divide worlds or seeds.
     """
+    hosts.join(options)
+    wanted = options.devices
     with contextlib.suppress(RuntimeError):  # JAX runs already, and has the devices that it has
         jax.config.update("jax_num_cpu_devices", wanted or _dividing(config, cores(), WORLDS_PER_CORE))
     _start(config)
     there = jax.device_count()
+    if jax.process_count() > 1:
+        wanted = there
     if wanted is None:
         return _dividing(config, there, WORLDS_PER_CORE if jax.default_backend() == "cpu" else 1)
     if wanted > there:

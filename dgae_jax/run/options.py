@@ -1,5 +1,6 @@
 """What a user may choose about a run beside its configuration."""
 
+import re
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -22,6 +23,13 @@ class RunOptions:
     devices: int | None = None
     """Devices that share the run, which divide its worlds or its seeds; by default all, and of a CPU's cores as many as have 16
     worlds each [devices]."""
+    coordinator: str | None = None
+    """Where the processes of a run on several hosts meet, HOST:PORT of the first; Slurm, Open MPI, Kubernetes and TPU pods say it
+    themselves [address]."""
+    num_processes: int | None = None
+    """Processes that share the run; 1 to train alone where a scheduler started several [processes]."""
+    process_id: int | None = None
+    """Which of them this is, from 0; the first one writes."""
     resume: Path | None = None
     """Continue the run in this directory, bit for bit, with its flags where none are given [path]."""
     resume_or_start: bool = False
@@ -37,7 +45,9 @@ class RunOptions:
 
 
 WHOLE = {
-    "devices": (1, 1_000_000, "of one machine"),
+    "devices": (1, 1_000_000, "in one run"),
+    "num_processes": (1, 100_000, "in one run"),
+    "process_id": (0, 99_999, "processes are counted from 0"),
     "checkpoint_every": (1, 2**31 - 1, "samples are counted in an int32"),
     "keep_checkpoints": (1, 1_000_000, "files in one directory"),
     "max_nonfinite": (1, 2**31 - 1, "iterations are counted in an int32"),
@@ -52,6 +62,16 @@ def validate_options(options: RunOptions) -> None:
         value = getattr(options, name)
         if value is not None and not low <= value <= high:
             raise invalid(name, value, f"a whole number from {low:,} to {high:,} ({reason})")
+    if options.coordinator is not None:
+        if not re.fullmatch(r"[^\s:]+:\d{1,5}", options.coordinator):
+            raise invalid("coordinator", options.coordinator, "HOST:PORT")
+        for name in ("num_processes", "process_id"):
+            if getattr(options, name) is None:
+                raise invalid(name, None, "given with --coordinator")
+    if options.process_id is not None and options.process_id >= (options.num_processes or 0):
+        raise invalid("process_id", options.process_id, f"below --num-processes {options.num_processes}")
+    if options.devices is not None and (options.num_processes or 1) > 1:
+        raise invalid("devices", options.devices, "left out with several processes, which use all of theirs")
     if options.resume is not None and options.run_dir is not None:
         raise invalid("run_dir", options.run_dir, f"left out: --resume writes to {options.resume}")
     if options.resume is not None and options.resume_or_start:

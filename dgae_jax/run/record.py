@@ -14,7 +14,7 @@ from dgae_jax.configs.build import Fitted
 from dgae_jax.configs.config import Config
 from dgae_jax.learn.types import TrainState
 from dgae_jax.physics.engine import PhysicsState
-from dgae_jax.run import checkpoint, curve
+from dgae_jax.run import checkpoint, curve, hosts
 from dgae_jax.run.compiling import Watch
 from dgae_jax.run.evaluation import evaluate_policies
 from dgae_jax.run.evaluations import EvaluationsFile
@@ -90,7 +90,7 @@ class Record:
     def _save_incidents(self, state: TrainState, seeds: set[int]) -> None:
         """Of every world that has turned non-finite the last state and action from which it did, per run: arrays by name."""
         for seed in sorted(seeds):
-            episodes = jax.tree.map(lambda x, i=seed - self.config.seed: np.asarray(x[i]), state.episodes)
+            episodes = jax.tree.map(lambda x, i=seed - self.config.seed: x[i], hosts.whole(state.episodes))
             worlds = np.flatnonzero(episodes.nonfinite)
             world, action = jax.tree.map(lambda x, at=worlds: x[at], episodes.incident)
             names = world._fields if isinstance(world, PhysicsState) else range(len(jax.tree.leaves(world)))

@@ -7,6 +7,8 @@ import threading
 from collections.abc import Iterator
 from typing import Any
 
+from dgae_jax.run import hosts
+
 KINDS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 """Ctrl-C, a scheduler, and a terminal that was closed."""
 
@@ -24,6 +26,7 @@ class Signals:
 
     def __init__(self):
         self.received: signal.Signals | None = None
+        self.agreed = False
         self.before: dict[signal.Signals, Any] = {}
         self.nothing_to_lose = False
 
@@ -39,13 +42,23 @@ class Signals:
 
     @contextlib.contextmanager
     def may_stop(self) -> Iterator[None]:
-        """Around work that may be broken off: raises `Stopped` when a signal arrives, or has arrived."""
-        self.nothing_to_lose = True
+        """Around work that may be broken off: raises `Stopped` when a signal arrives, or has arrived.
+
+        Of several processes none can be broken off alone: there only what all have agreed on counts.
+        """
+        self.nothing_to_lose = hosts.alone() or self.agreed
         try:
             self._stop()
             yield
         finally:
             self.nothing_to_lose = False
+
+    def anywhere(self) -> bool:
+        """Whether a signal has come to any process of the run; every process must ask."""
+        kind = hosts.most(self.received or 0)
+        if kind:
+            self.received, self.agreed = signal.Signals(kind), True
+        return self.agreed
 
     @property
     def name(self) -> str:

@@ -13,7 +13,7 @@ from dgae_jax.configs.config import Config
 from dgae_jax.learn.devices import make_mesh
 from dgae_jax.learn.parallel import Trainer
 from dgae_jax.learn.types import TrainState
-from dgae_jax.run import checkpoint, directory, files, manifest, terminal
+from dgae_jax.run import checkpoint, directory, files, hosts, manifest, terminal
 from dgae_jax.run.checkpoint import NotFiniteError
 from dgae_jax.run.compiling import compile_aside
 from dgae_jax.run.evaluation import engines_of, referee
@@ -79,7 +79,7 @@ def _iterate(config: Config, options: RunOptions, record: Record, signals: Signa
         state = _compiled(config, trainer, state, signals, reporter)
         if resumed and done % every == 0:
             _look(record, state, signals, reporter)  # unless it was evaluated before it stopped
-        stopping = bool(signals.received)
+        stopping = signals.anywhere()
         while done < config.iterations and not stopping:
             count = min(count, config.iterations - done, every - done % every)
             since, warm = time.monotonic(), seconds > 0
@@ -88,8 +88,8 @@ def _iterate(config: Config, options: RunOptions, record: Record, signals: Signa
             seconds, done = (time.monotonic() - since) / count, done + count
             if warm:  # the first dispatch says nothing about speed
                 reporter.update(done * config.samples_per_iteration, config.samples_per_iteration / seconds, mean_return)
-            count = int(np.clip(DISPATCH_SECONDS / seconds, 1, CAPACITY)) if warm else 1
-            broken, due, stopping = _broken(state, options), done % every == 0, bool(signals.received)
+            count = hosts.first(int(np.clip(DISPATCH_SECONDS / seconds, 1, CAPACITY))) if warm else 1
+            broken, due, stopping = _broken(state, options), done % every == 0, signals.anywhere()
             if due or done == config.iterations or stopping or broken:
                 record.save(state)
                 record.draw()
@@ -97,7 +97,7 @@ def _iterate(config: Config, options: RunOptions, record: Record, signals: Signa
                 break
             if due and done < config.iterations:
                 _look(record, state, signals, reporter)
-                stopping = bool(signals.received)  # all is saved
+                stopping = signals.anywhere()  # all is saved
     return state
 
 
@@ -115,7 +115,8 @@ def _compiled(config: Config, trainer: Trainer, state: TrainState | None, signal
 def _dispatch(config: Config, trainer: Trainer, state: TrainState, count: int, record: Record) -> tuple[TrainState, dict[str, Any]]:
     """The next iterations; if there is no memory for them, the state before is saved, as far as it was not consumed."""
     try:
-        return jax.block_until_ready(trainer.dispatch(config, state, count))
+        state, measured = jax.block_until_ready(trainer.dispatch(config, state, count))
+        return state, hosts.whole(measured)
     except (MemoryError, jax.errors.JaxRuntimeError) as reason:
         if _is_out_of_memory(reason) and record.steps and not any(x.is_deleted() for x in jax.tree.leaves(state)):
             record.save(state)
@@ -126,7 +127,7 @@ def _look(record: Record, state: TrainState, signals: Signals, reporter: Reporte
     """Evaluate on the way, unless a signal came: a run that goes on later makes up for it."""
     if not record.evaluated:
         with contextlib.suppress(Stopped), signals.may_stop():
-            record.evaluate(jax.device_get(policies_of(state)), reporter.watch)
+            record.evaluate(hosts.whole(policies_of(state)), reporter.watch)
 
 
 def _evaluate(config: Config, options: RunOptions, record: Record, signals: Signals, state: TrainState) -> dict[str, Any]:
@@ -134,15 +135,15 @@ def _evaluate(config: Config, options: RunOptions, record: Record, signals: Sign
     with signals.may_stop(), Reporter() as reporter:
         episodes = f"{options.episodes} episodes" + (f" of each of {config.num_seeds} seeds" if config.num_seeds > 1 else "")
         reporter.announce(f"evaluating {episodes} in {referee(config)} ({engines_of(config)[0]})")
-        return record.evaluate(jax.device_get(policies_of(state)), reporter.watch)
+        return record.evaluate(hosts.whole(policies_of(state)), reporter.watch)
 
 
 def _broken(state: TrainState, options: RunOptions) -> bool:
-    return int(state.failures.max()) >= options.max_nonfinite
+    return int(hosts.whole(state.failures).max()) >= options.max_nonfinite
 
 
 def _broke_down(state: TrainState, run_dir: Path) -> str:
-    lately = f"in each of the last {int(state.failures.max())} iterations"
+    lately = f"in each of the last {int(hosts.whole(state.failures).max())} iterations"
     reason = f"{lately} updates were not finite and were left out, or most world steps were not finite"
     return f"stopped: {reason}; the last finite state is in {run_dir}"
 

@@ -5,6 +5,7 @@ import pytest
 
 from dgae_jax.configs.config import ConfigError
 from dgae_jax.run import machine
+from dgae_jax.run.options import RunOptions
 from tests.runs import SMALL
 
 
@@ -23,4 +24,4 @@ def test_whatever_jax_says_about_a_device_is_one_line_that_says_how_to_install_f
     monkeypatch.setattr(jax, "devices", devices)
     monkeypatch.setenv("JAX_PLATFORMS", wanted)
     with pytest.raises(ConfigError, match=rf"^JAX_PLATFORMS={wanted}: must name a device that JAX finds here, .*{said}"):
-        machine.use_devices(SMALL)
+        machine.use_devices(SMALL, RunOptions())
