@@ -2,11 +2,11 @@
 
     pip install -e ".[bench]" && python benchmarks/throughput.py --json benchmarks/results/throughput.json
 
-Everyone trains on the same task with the same network (tanh), samples per iteration, epochs, minibatches and normalisation. stable-baselines3 and sb3-contrib run with 1, 8 and 16 worlds in one process, 8 and 16 in processes, on one and
-on all threads of torch; the fastest setting is the one to compare with. The roofline is the time of an iteration in which all
-cores do nothing but simulate (C MuJoCo), multiply matrices (the operations that the program counts, at the highest rate
-measured here) and evaluate the residuals of the quantile-Huber loss (at the rate measured here). Nothing else should run on
-the machine meanwhile.
+Everyone trains on the same task with the same network (tanh), samples per iteration, epochs, minibatches and normalisation.
+stable-baselines3 and sb3-contrib run with 1, 8 and 16 worlds in one process, 8 and 16 in processes, on one and on all threads of
+torch; the fastest setting is the one to compare with. The roofline is the time of an iteration in which all cores do nothing but
+simulate (C MuJoCo), multiply matrices (the operations that the program counts, at the highest rate measured here) and evaluate
+the residuals of the quantile-Huber loss (at the rate measured here). Nothing else should run on the machine meanwhile.
 """
 
 import dataclasses

@@ -45,6 +45,11 @@ def alone() -> bool:
     return jax.process_count() == 1
 
 
+def is_first() -> bool:
+    """Whether this is the process that writes."""
+    return jax.process_index() == 0
+
+
 def first(value: int) -> int:
     """The first process's value; every process must ask."""
     return value if alone() else int(multihost_utils.broadcast_one_to_all(np.int32(value)))
@@ -69,7 +74,7 @@ def whole(tree: Any) -> Any:
 @contextlib.contextmanager
 def writing(run_dir: Path) -> Iterator[Path]:
     """The directory that this process writes: the run's own, or for all but the first a copy of what there is, which goes at the end."""
-    if jax.process_index() == 0:
+    if is_first():
         _meet()
         yield run_dir
         return

@@ -82,11 +82,13 @@ def _exit_code(work: Callable[[Config, RunOptions], Finished], config: Config, o
     try:
         finished = work(config, options)
     except RunError as end:
-        (terminal.say if end.exit_code > 128 else terminal.warn)(str(end))
+        if hosts.is_first():
+            (terminal.say if end.exit_code > 128 else terminal.warn)(str(end))
         if compiling.is_running():
             os._exit(end.exit_code)
         return end.exit_code
-    terminal.say(f"{describe(finished.evaluation)}; files in {finished.directory}")
+    with terminal.silenced(not hosts.is_first()):
+        terminal.say(f"{describe(finished.evaluation)}; files in {finished.directory}")
     return 0
 
 

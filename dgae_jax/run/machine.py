@@ -23,7 +23,7 @@ WORLDS_PER_CORE = 16
 
 
 def use_devices(config: Config, options: RunOptions) -> int:
-    """Start JAX, together with the other processes of the run, and the number of devices that share it.
+    """Start JAX, together with the other processes of the run, and the number of devices of each process that share it.
 
     Raises ConfigError if there is none of the kind asked for, or they are not there or do not divide worlds or seeds.
     """
@@ -32,16 +32,18 @@ def use_devices(config: Config, options: RunOptions) -> int:
     with contextlib.suppress(RuntimeError):  # JAX runs already, and has the devices that it has
         jax.config.update("jax_num_cpu_devices", wanted or _dividing(config, cores(), WORLDS_PER_CORE))
     _start(config)
-    there = jax.device_count()
-    if jax.process_count() > 1:
-        wanted = there
-    if wanted is None:
+    there, processes = jax.local_device_count(), jax.process_count()
+    if wanted is None and processes == 1:
         return _dividing(config, there, WORLDS_PER_CORE if jax.default_backend() == "cpu" else 1)
-    if wanted > there:
-        raise invalid("devices", wanted, f"at most {there}, which JAX has here (a CPU is divided before JAX starts)")
-    if _dividing(config, wanted, 1) != wanted:
-        raise invalid("devices", wanted, f"a number that divides num_envs {config.num_envs} or num_seeds {config.num_seeds}")
-    return wanted
+    count = wanted or there
+    if count > there:
+        raise invalid("devices", count, f"at most {there}, which JAX has here (a CPU is divided before JAX starts)")
+    if count < there and processes > 1:
+        raise invalid("devices", count, f"left out with several processes, each of which uses all of its {there}")
+    if _dividing(config, count * processes, 1) != count * processes:
+        many = f" in each of {processes} processes" if processes > 1 else ""
+        raise invalid("devices", count, f"a number that divides num_envs {config.num_envs} or num_seeds {config.num_seeds}{many}")
+    return count
 
 
 def _dividing(config: Config, most: int, worlds_each: int) -> int:
@@ -86,6 +88,7 @@ def facts() -> dict[str, Any]:
     return {
         "device": f"{jax.default_backend()}: {_model()}",
         "cores": _cores(),
+        "processes": jax.process_count(),
         "settings": {name: getattr(jax.config, name, None) for name in _SETTINGS} | {"XLA_FLAGS": os.environ.get("XLA_FLAGS")},
     }
 

@@ -40,7 +40,7 @@ def changes(run_dir: Path, options: RunOptions) -> list[str]:
 
 
 def _deciding(part: dict[str, Any]) -> dict[str, Any]:
-    found = {name: part.get(name) for name in ("device", "cores", "git_revision")}
+    found = {name: part.get(name) for name in ("device", "cores", "processes", "git_revision")}
     for table in (part.get("settings"), part.get("versions")):
         found |= table if isinstance(table, dict) else {}
     options = part.get("options")

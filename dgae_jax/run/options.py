@@ -21,8 +21,8 @@ class RunOptions:
     keep_checkpoints: int = 3
     """The newest checkpoints that are kept, beside the one with the best evaluation [files]."""
     devices: int | None = None
-    """Devices that share the run, which divide its worlds or its seeds; by default all, and of a CPU's cores as many as have 16
-    worlds each [devices]."""
+    """Devices of each process that share the run, which divide its worlds or its seeds; by default all, and of a CPU's cores as
+    many as have 16 worlds each [devices]."""
     coordinator: str | None = None
     """Where the processes of a run on several hosts meet, HOST:PORT of the first; Slurm, Open MPI, Kubernetes and TPU pods say it
     themselves [address]."""
@@ -45,7 +45,7 @@ class RunOptions:
 
 
 WHOLE = {
-    "devices": (1, 1_000_000, "in one run"),
+    "devices": (1, 100_000, "in one machine"),
     "num_processes": (1, 100_000, "in one run"),
     "process_id": (0, 99_999, "processes are counted from 0"),
     "checkpoint_every": (1, 2**31 - 1, "samples are counted in an int32"),
@@ -70,8 +70,6 @@ def validate_options(options: RunOptions) -> None:
                 raise invalid(name, None, "given with --coordinator")
     if options.process_id is not None and options.process_id >= (options.num_processes or 0):
         raise invalid("process_id", options.process_id, f"below --num-processes {options.num_processes}")
-    if options.devices is not None and (options.num_processes or 1) > 1:
-        raise invalid("devices", options.devices, "left out with several processes, which use all of theirs")
     if options.resume is not None and options.run_dir is not None:
         raise invalid("run_dir", options.run_dir, f"left out: --resume writes to {options.resume}")
     if options.resume is not None and options.resume_or_start:

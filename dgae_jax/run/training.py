@@ -73,7 +73,7 @@ def _iterate(config: Config, options: RunOptions, record: Record, signals: Signa
     done, count, seconds = record.metrics.iteration, 1, 0.0
     if state is not None and done == config.iterations:
         return state
-    trainer = make_trainer(make_task(config), CAPACITY, make_mesh(options.devices or 1))
+    trainer = make_trainer(make_task(config), CAPACITY, make_mesh((options.devices or 1) * jax.process_count()))
     with Reporter(config.iterations * config.samples_per_iteration, config.num_seeds) as reporter:
         resumed = state is not None
         state = _compiled(config, trainer, state, signals, reporter)

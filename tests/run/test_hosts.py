@@ -7,10 +7,12 @@ import subprocess
 import sys
 import time
 
+import jax
 import numpy as np
 import pytest
 
-from dgae_jax.run import checkpoint, directory, restore
+from dgae_jax.run import checkpoint, directory, hosts, restore
+from dgae_jax.run.options import RunOptions
 from tests.helpers import ROOT, TINY
 from tests.runs import last, stopped_half_way, timeless
 
@@ -40,7 +42,7 @@ def whole(tmp_path_factory):
     (out, err, code), (other_out, other_err, other) = finished(pair(*FLAGS, "--run-dir", run_dir))
     assert (code, other) == (0, 0), err + other_err
     assert f"files in {run_dir}" in out
-    assert other_out == ""
+    assert "dgae_jax" not in other_out
     return run_dir
 
 
@@ -68,6 +70,12 @@ def test_a_run_of_two_processes_goes_on_bit_for_bit(whole, tmp_path):
     assert timeless(half) == timeless(whole)
 
 
+def test_devices_of_all_processes_must_come_out_even(tmp_path):
+    for _, err, code in finished(pair(*FLAGS, "--devices", "3", "--run-dir", tmp_path / "run")):
+        assert code == 2
+        assert "error: --devices 3: must be a number that divides num_envs 4 or num_seeds 1 in each of 2 processes\n" in err
+
+
 def test_a_signal_to_any_of_them_stops_all_with_one_checkpoint(tmp_path):
     run_dir = tmp_path / "run"
     processes = pair(*TINY, "--total-steps", "100_000_000", "--run-dir", run_dir)
@@ -88,9 +96,37 @@ def test_a_signal_to_any_of_them_stops_all_with_one_checkpoint(tmp_path):
         (("--coordinator", "here"), "--coordinator here: must be HOST:PORT"),
         (("--coordinator", "localhost:1", "--num-processes", "2"), "--process-id None: must be given with --coordinator"),
         (("--coordinator", "localhost:1", "--num-processes", "2", "--process-id", "2"), "--process-id 2: must be below --num-processes 2"),
-        (("--num-processes", "2", "--devices", "2"), "--devices 2: must be left out with several processes, which use all of theirs"),
     ],
 )
 def test_what_does_not_name_a_meeting_is_refused_in_one_line(flags, reason, tmp_path):
     ((_, err, code),) = finished([begun(*TINY, *flags, "--run-dir", tmp_path / "run")])
     assert (code, err) == (2, f"error: {reason}\n")
+
+
+SCHEDULERS = ("SLURM_NTASKS", "OMPI_COMM_WORLD_SIZE", "TPU_WORKER_HOSTNAMES", "KUBERNETES_SERVICE_HOST", "JOB_COMPLETION_INDEX")
+
+
+@pytest.mark.parametrize(
+    ("environment", "several"),
+    [
+        ({}, False),
+        ({"SLURM_NTASKS": "1"}, False),
+        ({"SLURM_NTASKS": "2"}, True),
+        ({"OMPI_COMM_WORLD_SIZE": "4"}, True),
+        ({"TPU_WORKER_HOSTNAMES": "one"}, False),
+        ({"TPU_WORKER_HOSTNAMES": "one,two"}, True),
+        ({"KUBERNETES_SERVICE_HOST": "here"}, False),
+        ({"KUBERNETES_SERVICE_HOST": "here", "JOB_COMPLETION_INDEX": "0"}, True),
+    ],
+)
+def test_processes_are_expected_where_a_scheduler_started_several(environment, several, monkeypatch):
+    for name in SCHEDULERS:
+        monkeypatch.delenv(name, raising=False)
+    for name, value in environment.items():
+        monkeypatch.setenv(name, value)
+    met = []
+    monkeypatch.setattr(jax.distributed, "initialize", lambda *where: met.append(where))
+    hosts.join(RunOptions())
+    assert met == ([(None, None, None)] if several else [])
+    hosts.join(RunOptions(num_processes=1))
+    assert len(met) == several
