@@ -202,7 +202,7 @@ def main() -> None:
     jax.config.update("jax_enable_compilation_cache", False)
     jax.config.update("jax_platforms", {"cpu": "cpu", "gpu": "cuda"}[arguments.device])
     jax.config.update("jax_enable_x64", arguments.x64)
-    jax.config.update("jax_num_cpu_devices", arguments.devices)
+    devices.divide_cpu(arguments.devices)
     warnings.simplefilter("ignore")
     print(f"{jax.devices()[0].device_kind}, jax {jax.__version__}; environment steps per second")
     speeds(arguments)

@@ -9,6 +9,7 @@ gathered on all of them, and estimates are made by each for itself. Of the two f
 Several runs side by side are divided instead, if their number allows it: then nothing is exchanged at all.
 """
 
+import os
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
@@ -21,8 +22,22 @@ from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec
 
 AXIS = "devices"
 
+THREADS_PER_DEVICE = 2
+"""Of JAX's pool on a CPU."""
+
 _MESH: ContextVar[Mesh | None] = ContextVar("mesh", default=None)
 """Of the program that is being traced; None where a device is alone."""
+
+
+def divide_cpu(count: int) -> None:
+    """Let a CPU pose as so many devices; raises RuntimeError if JAX runs already.
+
+    A device that waits for another blocks a thread of JAX's pool. With only as many threads as devices, what the other one needs a
+    thread for might never begin, so there are more.
+    """
+    jax.config.update("jax_num_cpu_devices", count)
+    if count > 1 or jax.distributed.is_initialized():
+        os.environ["PJRT_NPROC"] = str(THREADS_PER_DEVICE * count)
 
 
 def make_mesh(count: int) -> Mesh | None:

@@ -37,7 +37,7 @@ def make_trainer(make_train: Callable[[Any], tuple[Callable, Callable]], capacit
     @partial(jax.jit, compiler_options=COMPILER_OPTIONS)
     def init(config: Any, keys: jax.Array) -> TrainState:
         with devices.shared_by(mesh):
-            return over_seeds(make_train(config)[0])(keys)
+            return over_seeds(make_train(config)[0], in_turn)(keys)
 
     @partial(jax.jit, donate_argnums=1, compiler_options=COMPILER_OPTIONS)
     def dispatch(config: Any, state: TrainState, count: ArrayLike):
@@ -58,15 +58,24 @@ def make_trainer(make_train: Callable[[Any], tuple[Callable, Callable]], capacit
     return Trainer(init, dispatch)
 
 
-def over_seeds(f: Callable) -> Callable:
-    """`f` mapped over the leading axis of its argument, which is divided between devices where that comes out even.
+def in_turn(f: Callable) -> Callable:
+    """`f` for one after the other.
+
+    The first weights need QR decompositions, and XLA's CPU code for many of them side by side may wait for threads that wait for it
+    (seen: two seeds of 64 worlds on two cores hang).
+    """
+    return partial(jax.lax.map, f)
+
+
+def over_seeds(f: Callable, many: Callable[[Callable], Callable] = jax.vmap) -> Callable:
+    """`f` mapped by `many` over the leading axis of its argument, which is divided between devices where that comes out even.
 
     An axis of one is taken off and put back: XLA's CPU code for arrays with a leading 1 is several times slower.
     """
 
     def mapped(tree: Any) -> Any:
         if _seeds(tree) > 1:
-            return jax.vmap(f)(tree)
+            return many(f)(tree)
         return jax.tree.map(lambda x: jnp.expand_dims(x, 0), f(jax.tree.map(lambda x: x[0], tree)))
 
     def shared(tree: Any) -> Any:

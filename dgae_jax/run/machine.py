@@ -9,6 +9,7 @@ from typing import Any
 import jax
 
 from dgae_jax.configs.config import Config, ConfigError, invalid
+from dgae_jax.learn.devices import divide_cpu
 from dgae_jax.physics.native import cores
 from dgae_jax.physics.registry import ENGINES
 from dgae_jax.run import hosts, terminal
@@ -30,7 +31,7 @@ def use_devices(config: Config, options: RunOptions) -> int:
     hosts.join(options)
     wanted = options.devices
     with contextlib.suppress(RuntimeError):  # JAX runs already, and has the devices that it has
-        jax.config.update("jax_num_cpu_devices", wanted or _dividing(config, cores(), WORLDS_PER_CORE))
+        divide_cpu(wanted or _dividing(config, cores(), WORLDS_PER_CORE))
     _start(config)
     there, processes = jax.local_device_count(), jax.process_count()
     if wanted is None and processes == 1:

@@ -4,15 +4,12 @@ import dataclasses
 import sys
 
 import jax
+import numpy as np
 
-jax.config.update("jax_num_cpu_devices", 4)
-
-import numpy as np  # noqa: E402
-
-import dgae_jax as dg  # noqa: E402
-from dgae_jax.configs.build import make_trainer, seed_keys  # noqa: E402
-from dgae_jax.learn import devices  # noqa: E402
-from tests.helpers import small  # noqa: E402
+import dgae_jax as dg
+from dgae_jax.configs.build import make_trainer, seed_keys
+from dgae_jax.learn import devices
+from tests.helpers import small
 
 ITERATIONS = 10
 
@@ -28,14 +25,15 @@ def trained(algo, count, seeds=1, iterations=ITERATIONS):
 
 def main(path):
     """Write everything to one file."""
+    devices.divide_cpu(4)
     found = {}
     for name in ("dppo", "dtrpo"):
         found[f"{name} start"], _ = trained(name, 1, iterations=0)
         for count in (1, 2, 4):
             found[f"{name} {count}"], rows = trained(name, count)
             found[f"{name} {count} reward"] = rows["reward"]
-    for count in (1, 4):
-        found[f"seeds {count}"], _ = trained("dppo", count, seeds=4)
+    for seeds, count in ((4, 1), (4, 4), (3, 1), (3, 4)):
+        found[f"{seeds} seeds {count}"], _ = trained("dppo", count, seeds)
     devices._apart = lambda mesh: False  # as on accelerators
     for name in ("dppo", "dtrpo"):
         found[f"{name} gradients"], _ = trained(name, 4)
