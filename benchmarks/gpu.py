@@ -72,14 +72,11 @@ def engine(task: str, name: str, worlds: int, arguments: Arguments) -> dict[str,
 
 def training(algo: str, worlds: int, seeds: int, arguments: Arguments) -> dict[str, Any]:
     """Samples per second of all seeds together, seconds to compile, and the most memory so far."""
-    config = dataclasses.replace(
-        dg.Config(), env=arguments.tasks[0], algo=algo, physics="jax", num_envs=worlds, horizon=16, num_seeds=seeds
-    )
-    config = resolve(dataclasses.replace(config, total_steps=100 * config.samples_per_iteration))
+    config = resolve(dg.Config(env=arguments.tasks[0], algo=algo, num_envs=worlds, horizon=16, num_seeds=seeds, total_steps=10**7))
     began = time.perf_counter()
     trainer = make_trainer(make_task(config), 1)
     state = trainer.init(config, seed_keys(config))
-    state, _ = jax.block_until_ready(trainer.dispatch(config, state, 1))
+    state, rows = jax.block_until_ready(trainer.dispatch(config, state, 1))
     compiled, since, count = time.perf_counter() - began, time.perf_counter(), 0
     while time.perf_counter() - since < arguments.seconds:
         state, rows = jax.block_until_ready(trainer.dispatch(config, state, 1))
