@@ -34,7 +34,6 @@ from dgae_jax.configs.build import make_task, make_trainer, seed_keys
 from dgae_jax.configs.config import Config, resolve
 from dgae_jax.learn import devices, iteration
 from dgae_jax.learn.parallel import COMPILER_OPTIONS
-from dgae_jax.learn.rollout import rollout
 from dgae_jax.learn.types import Fitted
 from dgae_jax.physics.native import cores
 from dgae_jax.run import machine
@@ -134,22 +133,19 @@ def taken_apart(config: Config, count: int) -> Pieces:
     init, _ = dg.make_train(algorithm, env, config)
     key = jax.random.key(0)
     state = jax.jit(init)(key)
-    keys, actor = jax.random.split(key, (config.horizon, config.num_envs)), Fitted(state.policy.params, state.observations)
+    keys = jax.random.split(key, (config.horizon, config.num_envs))
 
-    def alone(actor, episodes, keys):
-        return rollout(env, iteration._acting(algorithm, actor), episodes, keys, episode_length=config.episode_length)
-
-    def roll(actor, episodes, keys):
-        with devices.shared_by(mesh):
-            return devices.divided(alone, (None, 0, 1), (0, 1))(actor, episodes, keys)
+    @devices.shared_by(mesh)
+    def roll(state, keys):
+        return iteration._roll_out(env, algorithm, state, keys, config.episode_length)
 
     def estimate(state, step):
         return iteration._estimate(algorithm, state, step, step.reward, key, config.gamma, config.lam, iteration.nothing)[0]
 
-    step = jax.device_get(jax.jit(roll)(actor, state.episodes, keys)[1])
+    step = jax.device_get(jax.jit(roll)(state, keys)[1])
     batch = jax.jit(estimate)(state, step)
     return Pieces(
-        (roll, (actor, state.episodes, keys)),
+        (roll, (state, keys)),
         (estimate, (state, step)),
         (algorithm.policy_update.step, (key, state.policy, batch)),
         (algorithm.critic_update.step, (key, state.critic, batch)),
@@ -170,17 +166,18 @@ def roofline(config: Config) -> float:
     flops = sum(float(counted(f, "cpu")(*args)[1].flops) for f, args in _without_physics(config))
     products = flops / product_rate()
     quantiles, fit = config.critic.quantiles, config.critic
-    residuals = (fit.epochs or 0) * config.samples_per_iteration * quantiles**2 if quantiles else 0
+    targets = 1 if fit.target == "lambda-return" else quantiles
+    residuals = (fit.epochs or 0) * config.samples_per_iteration * quantiles * targets if quantiles and targets else 0
     return c_seconds(config.env, config.num_envs, config.horizon) + products + residuals / (cores() * residual_rate(quantiles or 1))
 
 
 def _without_physics(config: Config) -> list[tuple[Callable, tuple]]:
     """Acting on all samples, estimating, fitting."""
     pieces = taken_apart(dataclasses.replace(config, physics="native"), 1)
-    actor, episodes, _ = pieces.rollout[1]
-    env = make_task(config)
+    state, _ = pieces.rollout[1]
+    actor, env = Fitted(state.policy.params, state.observations), make_task(config)
     act = iteration._acting(dg.make_algorithm(str(config.algo), env, config), actor)
-    keys, obs = jax.random.split(jax.random.key(0), config.num_envs), episodes.env.obs
+    keys, obs = jax.random.split(jax.random.key(0), config.num_envs), state.episodes.env.obs
     acting = lambda: jax.lax.scan(lambda c, _: (c, act(keys, obs)[0]), 0, None, length=config.horizon)[1]  # noqa: E731
     return [(acting, ()), *pieces[1:]]
 

@@ -3,7 +3,7 @@
 A mesh has one axis. Worlds are divided over it, and every device rolls out its own without a word to the others. What they saw is
 gathered on all of them, and estimates are made by each for itself. Of the two fits
 
-- each has a CPU device of its own, because there a gradient step is shorter than the exchange of a gradient;
+- each has a CPU device of its own, because there a gradient step is too short to be shared;
 - accelerators share every minibatch, whose gradient XLA sums over them.
 
 Several runs side by side are divided instead, if their number allows it: then nothing is exchanged at all.

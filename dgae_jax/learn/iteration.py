@@ -54,13 +54,8 @@ def make_train(
     @jax.default_matmul_precision("highest")  # TF32 ruins training on GPUs that default to it
     def train_step(state: TrainState) -> tuple[TrainState, Metrics]:
         act_key, target_key, policy_key, critic_key, key = jax.random.split(state.key, 5)
-
-        def roll_out(actor: Fitted, episodes: Episodes, keys: Key[Array, "T N"]) -> tuple[Episodes, Transition]:
-            return rollout(env, _acting(algorithm, actor), episodes, keys, episode_length=episode_length)
-
-        actor, keys = Fitted(state.policy.params, state.observations), jax.random.split(act_key, (horizon, num_envs))
-        episodes, step = devices.divided(roll_out, (None, 0, 1), (0, 1))(actor, state.episodes, keys)
-        step = devices.gather(step)
+        keys = jax.random.split(act_key, (horizon, num_envs))
+        episodes, step = _roll_out(env, algorithm, state, keys, episode_length)
         reward_scale, reward, observations = state.reward_scale, step.reward, state.observations
         if normalize_rewards:
             done = (step.terminated | step.truncated).astype(reward.dtype)
@@ -93,6 +88,19 @@ def _kept_if_finite(new: Fit, info: Metrics, before: Fit) -> tuple[Fit, Bool[Arr
     """One network's update, left out if it is not finite: policy and critic each stand for themselves."""
     finite = jnp.stack([jnp.isfinite(x).all() for x in jax.tree.leaves((new, info["loss"]))]).all()
     return jax.tree.map(lambda after, before: jnp.where(finite, after, before), new, before), finite
+
+
+def _roll_out(
+    env: Env, algorithm: Algorithm, state: TrainState, keys: Key[Array, "T N"], episode_length: int
+) -> tuple[Episodes, Transition]:
+    """Every device rolls out its own worlds; what they saw is known to all."""
+
+    def share(actor: Fitted, episodes: Episodes, keys: Key[Array, "T n"]) -> tuple[Episodes, Transition]:
+        return rollout(env, _acting(algorithm, actor), episodes, keys, episode_length=episode_length)
+
+    actor = Fitted(state.policy.params, state.observations)
+    episodes, step = devices.divided(share, (None, 0, 1), (0, 1))(actor, state.episodes, keys)
+    return episodes, devices.gather(step)
 
 
 def _acting(algorithm: Algorithm, actor: Fitted) -> Act:

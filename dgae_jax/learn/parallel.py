@@ -35,16 +35,13 @@ def make_trainer(make_train: Callable[[Any], tuple[Callable, Callable]], capacit
     """
 
     @partial(jax.jit, compiler_options=COMPILER_OPTIONS)
+    @devices.shared_by(mesh)
     def init(config: Any, keys: jax.Array) -> TrainState:
-        with devices.shared_by(mesh):
-            return over_seeds(make_train(config)[0], in_turn)(keys)
+        return over_seeds(make_train(config)[0], in_turn)(keys)
 
     @partial(jax.jit, donate_argnums=1, compiler_options=COMPILER_OPTIONS)
+    @devices.shared_by(mesh)
     def dispatch(config: Any, state: TrainState, count: ArrayLike):
-        with devices.shared_by(mesh):
-            return iterated(config, state, count)
-
-    def iterated(config: Any, state: TrainState, count: ArrayLike):
         step = jax.jit(over_seeds(make_train(config)[1]))  # jitted, so that asking for its shapes does not trace it twice
         rows = jax.tree.map(lambda x: jnp.zeros((capacity, *x.shape), x.dtype), jax.eval_shape(step, state)[1])
 

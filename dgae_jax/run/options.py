@@ -68,6 +68,9 @@ def validate_options(options: RunOptions) -> None:
         for name in ("num_processes", "process_id"):
             if getattr(options, name) is None:
                 raise invalid(name, None, "given with --coordinator")
+    elif options.process_id is not None or options.num_processes not in (None, 1):
+        name = "num_processes" if options.process_id is None else "process_id"
+        raise invalid(name, getattr(options, name), "left out without --coordinator")
     if options.process_id is not None and options.process_id >= (options.num_processes or 0):
         raise invalid("process_id", options.process_id, f"below --num-processes {options.num_processes}")
     if options.resume is not None and options.run_dir is not None:

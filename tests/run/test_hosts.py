@@ -96,6 +96,8 @@ def test_a_signal_to_any_of_them_stops_all_with_one_checkpoint(tmp_path):
         (("--coordinator", "here"), "--coordinator here: must be HOST:PORT"),
         (("--coordinator", "localhost:1", "--num-processes", "2"), "--process-id None: must be given with --coordinator"),
         (("--coordinator", "localhost:1", "--num-processes", "2", "--process-id", "2"), "--process-id 2: must be below --num-processes 2"),
+        (("--num-processes", "2"), "--num-processes 2: must be left out without --coordinator"),
+        (("--process-id", "0"), "--process-id 0: must be left out without --coordinator"),
     ],
 )
 def test_what_does_not_name_a_meeting_is_refused_in_one_line(flags, reason, tmp_path):
