@@ -8,21 +8,32 @@ PEER_OF = {"ppo": "PPO", "dppo": "PPO", "trpo": "TRPO", "dtrpo": "TRPO", "a2c": 
 """The peers' algorithm to compare with."""
 
 
+def rival_of(row: dict, peers: list[dict]) -> dict | None:
+    """The fastest layout of stable-baselines3, or sb3-contrib for TRPO, on the task of a row; None if it was not measured."""
+    theirs = [
+        peer
+        for peer in peers
+        if peer["name"].startswith("stable-baselines3")
+        and (peer["task"], peer["width"], peer["algo"]) == (row["task"], row["width"], PEER_OF[row["algo"]])
+    ]
+    return max(theirs, key=lambda peer: peer["steps_per_second"], default=None)
+
+
 def table(found: dict) -> str:
-    """A row per algorithm and engine, then the peers' fastest."""
+    """A row per algorithm and engine, then every peer in its fastest layout."""
     lines = ["| | compile | steps/s | over the peer | of the roofline |", "|---|---|---|---|---|"]
-    peers = {}
-    for peer in found["peers"]:
-        key = peer["task"], peer["width"], peer["algo"]
-        peers[key] = max(peers.get(key, peer), peer, key=lambda p: p["steps_per_second"])
+    tasks = {(row["task"], row["width"]) for row in found["ours"]}
     for row in found["ours"]:
-        rival = peers.get((row["task"], row["width"], PEER_OF[row["algo"]]))
+        rival = rival_of(row, found["peers"])
         over = f"{row['steps_per_second'] / rival['steps_per_second']:.1f} ×" if rival else "–"
-        lines.append(
-            f"| {row['algo'].upper()}, `{row['physics']}` | {row['compile_seconds']:.1f} s | {row['steps_per_second']:,.0f} | {over} |"
-            f" {row['steps_per_second'] / row['roofline']:.2f} |"
-        )
-    lines += [f"| {peer['name']} | – | {peer['steps_per_second']:,.0f} | 1 | – |" for peer in peers.values()]
+        where = f", {row['task'].title()}, 2 × {row['width']}" if len(tasks) > 1 else ""
+        name = f"{row['algo'].upper()}, `{row['physics']}`{where}"
+        share = row["steps_per_second"] / row["roofline"]
+        lines.append(f"| {name} | {row['compile_seconds']:.1f} s | {row['steps_per_second']:,.0f} | {over} | {share:.2f} |")
+    fastest = {}
+    for peer in sorted(found["peers"], key=lambda peer: peer["steps_per_second"]):
+        fastest[peer["name"].split()[0], peer["task"], peer["width"], peer["algo"]] = peer
+    lines += [f"| {peer['name']} | – | {peer['steps_per_second']:,.0f} | – | – |" for peer in fastest.values()]
     return "\n".join(lines)
 
 

@@ -4,9 +4,10 @@
 
 Everyone trains on the same task with the same network (tanh), samples per iteration, epochs, minibatches and normalisation.
 stable-baselines3 and sb3-contrib run with 1, 8 and 16 worlds in one process, 8 and 16 in processes, on one and on all threads of
-torch; the fastest setting is the one to compare with. The roofline is the time of an iteration in which all cores do nothing but
-simulate (C MuJoCo), multiply matrices (the operations that the program counts, at the highest rate measured here) and evaluate
-the residuals of the quantile-Huber loss (at the rate measured here). Nothing else should run on the machine meanwhile.
+torch; the fastest setting is the one to compare with. Brax's and rejax's PPO run on our own `jax` engine. The roofline is the time
+of an iteration in which all cores do nothing but simulate (C MuJoCo), multiply matrices (the operations that the program counts, at
+the highest rate measured here) and evaluate the residuals of the quantile-Huber loss (at the rate measured here). Nothing else
+should run on the machine meanwhile.
 """
 
 import dataclasses
@@ -24,8 +25,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import peers
+import peers_jax
 from mujoco.batch import Batch
-from table import PEER_OF
+from table import PEER_OF, rival_of
 from turns import counted
 
 import dgae_jax as dg
@@ -35,7 +37,7 @@ from dgae_jax.configs.config import Config, resolve
 from dgae_jax.learn import devices, iteration
 from dgae_jax.learn.parallel import COMPILER_OPTIONS
 from dgae_jax.learn.types import Fitted
-from dgae_jax.physics.native import cores
+from dgae_jax.physics.cores import cores
 from dgae_jax.run import machine
 from dgae_jax.run.options import RunOptions
 
@@ -228,7 +230,8 @@ def main() -> None:
     if arguments.peers:
         for task, width in itertools.product(arguments.tasks, arguments.widths):
             samples = {PEER_OF[algo]: setting(task, algo, "native", width).samples_per_iteration for algo in arguments.algos}
-            for measured in peers.all_of(task, width, arguments.seconds, samples):
+            theirs = peers.all_of(task, width, arguments.seconds, samples)
+            for measured in itertools.chain(theirs, peers_jax.all_of(task, width, arguments.seconds)):
                 others.append(measured)
                 print(f"{measured.name:76s} {measured.steps_per_second:9,.0f}", flush=True)
     print(f"{cores()} cores, {jax.devices()[0].device_kind}, jax {jax.__version__}; milliseconds of each part alone")
@@ -239,10 +242,8 @@ def main() -> None:
         with multiprocessing.get_context("spawn").Pool(1) as process:  # JAX starts with as many devices as the run has
             row = process.apply(ours, (config, arguments.seconds))
         rows.append(row)
-        rival = max(
-            (o.steps_per_second for o in others if (o.task, o.width, o.algo) == (row.task, row.width, PEER_OF[row.algo])), default=0
-        )
-        over = f"{row.steps_per_second / rival:7.1f}" if rival else f"{'':7s}"
+        rival = rival_of(dataclasses.asdict(row), [dataclasses.asdict(o) for o in others])
+        over = f"{row.steps_per_second / rival['steps_per_second']:7.1f}" if rival else f"{'':7s}"
         print(
             f"{row.task:7s} {row.algo:5s} {row.physics:7s} {row.width:5d} {row.compile_seconds:9.1f} {row.steps_per_second:9,.0f} {over}"
             f" {row.steps_per_second / row.roofline:10.2f}",

@@ -12,7 +12,7 @@ from typing import Literal
 import tyro
 
 from dgae_jax.cli.arguments import fail, parse
-from dgae_jax.configs.config import ConfigError, invalid
+from dgae_jax.configs.config import Config, ConfigError, invalid
 from dgae_jax.run import directory, files, terminal
 from dgae_jax.run.options import WHOLE, RunOptions
 
@@ -22,7 +22,7 @@ class Arguments:
     """What to evaluate, and how."""
 
     run_dir: tyro.conf.Positional[Path]
-    """Directory of the run [path]."""
+    """Directory of the run, or the file of a policy [path]."""
     engine: Literal["gymnasium", "native", "jax", "mjx", "mjx-warp"] | None = None
     """gymnasium (the task of the gymnasium package), or an engine as in --physics of the training; by default the first that the
     run can have."""
@@ -33,7 +33,8 @@ class Arguments:
     seed: int = 0
     """Seed of the initial states; no two seeds share any [1]."""
     out: Path | None = None
-    """File to write; by default evaluation-ENGINE.json or evaluation-ENGINE-best.json in the run directory [path]."""
+    """File to write; by default evaluation-ENGINE.json or evaluation-ENGINE-best.json in the run directory, or beside the policy's
+    file, with its name in front [path]."""
     cache_dir: str = RunOptions.cache_dir
     """Where compiled programs are kept between runs; none disables [path]."""
 
@@ -66,7 +67,7 @@ def _check(arguments: Arguments) -> None:
 
 
 def _evaluate(arguments: Arguments) -> int:
-    config = directory.read_config(arguments.run_dir)
+    config = _config_of(arguments.run_dir)
     from dgae_jax.run import evaluation, machine
     from dgae_jax.run.progress import Reporter
     from dgae_jax.run.summary import describe
@@ -86,6 +87,15 @@ def _evaluate(arguments: Arguments) -> int:
         raise invalid("out", out, f"a file that can be written ({reason.strerror})") from reason
     terminal.say(f"{describe(result)}, {result['checkpoint']}; written to {out}")
     return 0
+
+
+def _config_of(source: Path) -> Config:
+    """Without JAX where it can be had without."""
+    if not source.is_file():
+        return directory.read_config(source)
+    from dgae_jax.run import restore
+
+    return restore.config_of(source)
 
 
 if __name__ == "__main__":

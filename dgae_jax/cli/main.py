@@ -7,7 +7,8 @@ from dgae_jax.run import terminal
 
 COMMANDS = {
     "train": "train a policy and write a run directory",
-    "evaluate": "evaluate the policy of a run directory",
+    "evaluate": "evaluate the policy of a run directory, or of a file",
+    "reproduce": "train all of a study: tasks, algorithms and seeds",
 }
 """Each is a module of this room with a `main`."""
 

@@ -6,7 +6,6 @@ It compiles in seconds, runs on CPU threads, and is the referee for the other en
 import contextlib
 import hashlib
 import math
-import os
 from collections.abc import Iterator, Sequence
 from functools import partial
 
@@ -17,14 +16,10 @@ from jaxtyping import Array
 from mujoco.batch import Batch
 
 from dgae_jax.physics import ffi, quiet
+from dgae_jax.physics.cores import cores
 from dgae_jax.physics.engine import Physics, PhysicsState, Reads, body_ids, refuse_hidden_state
 
 _FIELDS = ("qpos", "qvel", "qacc_warmstart")
-
-
-def cores() -> int:
-    """Cores that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 class _Host:

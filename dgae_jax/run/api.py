@@ -14,7 +14,7 @@ import numpy as np
 from dgae_jax.configs.build import make_greedy, make_quantiles, make_task
 from dgae_jax.configs.config import Config, ConfigError, resolve
 from dgae_jax.learn.types import Fitted
-from dgae_jax.run import directory, loop, metrics, restore, terminal
+from dgae_jax.run import loop, metrics, restore, terminal
 from dgae_jax.run.options import RunOptions
 from dgae_jax.run.training import RunError
 
@@ -84,12 +84,12 @@ def train(config: Config, run_dir: str | Path | None = None, *, quiet: bool = Fa
 
 
 def load_policy(run_dir: str | Path, which: str = "newest", *, seed: int = 0) -> Policy:
-    """The policy of a run's newest checkpoint, or of its best evaluation's (`which="best"`).
+    """The policy of a run's newest checkpoint, or of its best evaluation's (`which="best"`); `run_dir` may be a policy's file.
 
     `seed` is the index among the seeds trained side by side (`num_seeds`). Only networks and observation statistics are read.
     Raises ConfigError for an invalid argument or a directory that holds no run, CheckpointError if no checkpoint can be read.
     """
-    config = resolve(directory.read_config(Path(run_dir)))
+    config = resolve(restore.config_of(Path(run_dir)))
     if not (type(seed) is int and 0 <= seed < config.num_seeds):
         raise ConfigError(f"seed {seed}: must be a whole number from 0 to {config.num_seeds - 1}, the index of a trained seed")
     found = restore.trained(Path(run_dir), config, which)

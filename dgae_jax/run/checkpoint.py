@@ -55,15 +55,20 @@ def save(directory: Path, config: Config, arrays: dict[str, np.ndarray], steps: 
     """
     for name in not_finite(arrays):
         raise NotFiniteError(f"{name} is not finite after {steps:,} samples")
-    packed = {name: _packed(x) for name, x in arrays.items()}
-    body: bytes = msgpack.packb({"arrays": packed, "config": json.dumps(to_dict(config), allow_nan=False)})  # pyright: ignore[reportAssignmentType]
-    header = {"schema": SCHEMA, "sha256": hashlib.sha256(body).hexdigest()}
     path = directory / name_of(steps)
-    files.replace(path, json.dumps(header, allow_nan=False).encode() + b"\n" + body)
+    write(path, config, arrays)
     for old in [p for p in found(directory) if p.name <= path.name][:-keep]:
         if best is None or old.name != name_of(best):
             old.unlink(missing_ok=True)
     return path
+
+
+def write(path: Path, config: Config, arrays: dict[str, np.ndarray]) -> None:
+    """Arrays by name and the configuration that they belong to as one file, complete or not at all."""
+    packed = {name: _packed(x) for name, x in arrays.items()}
+    body: bytes = msgpack.packb({"arrays": packed, "config": json.dumps(to_dict(config), allow_nan=False)})  # pyright: ignore[reportAssignmentType]
+    header = {"schema": SCHEMA, "sha256": hashlib.sha256(body).hexdigest()}
+    files.replace(path, json.dumps(header, allow_nan=False).encode() + b"\n" + body)
 
 
 def _packed(x: np.ndarray) -> msgpack.ExtType:

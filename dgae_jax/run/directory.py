@@ -23,6 +23,10 @@ from dgae_jax.run import files, manifest, terminal
 from dgae_jax.run.options import RunOptions
 
 
+class InUseError(ConfigError):
+    """A run directory in which another process trains."""
+
+
 def default_path(config: Config) -> Path:
     """runs/ENV-ALGO-SEED-TIME below the working directory."""
     return Path("runs") / f"{config.env}-{config.algo}-{config.seed}-{time.strftime('%Y%m%d-%H%M%S')}"
@@ -137,7 +141,7 @@ def _lock(file) -> None:
     try:
         fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError:
-        raise ConfigError(f"{Path(file.name).parent}: must not be in use; another process is training there") from None
+        raise InUseError(f"{Path(file.name).parent}: must not be in use; another process is training there") from None
     except OSError as reason:  # some network file systems have no locks
         terminal.warn(f"warning: {file.name} cannot be locked ({reason.strerror}): train in it with one process only")
 

@@ -36,9 +36,10 @@ def referee(config: Config) -> str:
     return spec_of(config.env).referee(config.env_version) or config.env
 
 
-def default_path(run_dir: Path, engine: str, which: str) -> Path:
-    """The file of an evaluation after training, one for each engine and choice of checkpoint."""
-    return run_dir / f"evaluation-{engine}{'' if which == 'newest' else f'-{which}'}.json"
+def default_path(source: Path, engine: str, which: str) -> Path:
+    """The file of an evaluation after training, one for each engine and choice of checkpoint; beside a policy's own file."""
+    name = f"evaluation-{engine}{'' if which == 'newest' else f'-{which}'}.json"
+    return source.with_name(f"{source.stem}-{name}") if source.is_file() else source / name
 
 
 def episode_seeds(seed: int, episodes: int) -> np.ndarray:

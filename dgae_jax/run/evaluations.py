@@ -31,7 +31,7 @@ class EvaluationsFile:
 
     def append(self, steps: int, result: dict[str, Any]) -> None:
         """Note an evaluation after `steps` samples; returns that are not finite are written, and count for nothing."""
-        rows = [{"steps": steps, **{k: one[k] for k in ("seed", "return_mean", "return_std")}} for one in result["seeds"]]
+        rows = [{"steps": steps, **{k: one[k] for k in ("seed", "return_mean", "return_std", "returns")}} for one in result["seeds"]]
         files.append_rows(self.path, rows)
         self.rows += [row for row in rows if _is_evaluation(row)]
 

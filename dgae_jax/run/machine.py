@@ -10,7 +10,7 @@ import jax
 
 from dgae_jax.configs.config import Config, ConfigError, invalid
 from dgae_jax.learn.devices import divide_cpu
-from dgae_jax.physics.native import cores
+from dgae_jax.physics.cores import cores
 from dgae_jax.physics.registry import ENGINES
 from dgae_jax.run import hosts, terminal
 from dgae_jax.run.options import RunOptions

@@ -11,7 +11,7 @@ from dgae_jax.configs.build import make_task, make_trainer, seed_keys
 from dgae_jax.configs.config import Config, invalid
 from dgae_jax.configs.serial import MAY_CHANGE, differences
 from dgae_jax.learn.types import Fitted, TrainState
-from dgae_jax.run import checkpoint, terminal
+from dgae_jax.run import checkpoint, directory, terminal
 from dgae_jax.run.checkpoint import CheckpointError, DamagedError
 from dgae_jax.run.evaluations import EvaluationsFile
 
@@ -37,13 +37,23 @@ def training_state(run_dir: Path, config: Config) -> tuple[TrainState, Path]:
     return _newest(run_dir, partial(load_state, config=config))
 
 
-def trained(run_dir: Path, config: Config, which: str) -> Trained:
-    """The networks of the newest checkpoint or the best; nothing else in the file is looked at.
+def config_of(source: Path) -> Config:
+    """Of a run directory, or of a file with networks; raises ConfigError if it is neither."""
+    return checkpoint.config_of(source) if source.is_file() else directory.read_config(source)
+
+
+def trained(source: Path, config: Config, which: str) -> Trained:
+    """The networks of a run directory's newest checkpoint or its best, or of a file; nothing else in the file is looked at.
 
     Raises ConfigError if the best is asked for and nothing was evaluated, CheckpointError as `training_state`.
     """
     if which not in CHOICES:
         raise invalid("checkpoint", which, f"one of {', '.join(CHOICES)}")
+    if source.is_file():
+        if which != "newest":
+            raise invalid("checkpoint", which, f"newest: {source} is a single one")
+        return _load_networks(source, config)
+    run_dir = source
     if which == "newest":
         return _newest(run_dir, partial(_load_networks, config=config))[0]
     steps = EvaluationsFile(run_dir / "evaluations.jsonl").best
@@ -62,14 +72,21 @@ def load_state(path: Path, config: Config) -> TrainState:
     return state
 
 
+def save_networks(path: Path, config: Config, networks: Trained) -> None:
+    """What acting and predicting takes as a file of its own, which `trained` reads."""
+    (policy, critic), stats = (networks.policy, networks.critic), networks.policy.observations
+    checkpoint.write(path, config, checkpoint.arrays_of(_networks(policy.params, critic.params, stats)))
+
+
+def _networks(policy: Any, critic: Any, observations: Any) -> dict[str, Any]:
+    """As they are named in a training state."""
+    return {"policy": {"params": policy}, "critic": {"params": critic}, "observations": observations}
+
+
 def _load_networks(path: Path, config: Config) -> Trained:
     _compare(path, config)
     blank: Any = _blank(config)
-    part = {
-        "policy": {"params": blank.policy.params},
-        "critic": {"params": blank.critic.params},
-        "observations": blank.observations,
-    }
+    part = _networks(blank.policy.params, blank.critic.params, blank.observations)
     got = checkpoint.load(path, part, part=True)
     policy, critic = (Fitted(got[name]["params"], got["observations"]) for name in ("policy", "critic"))
     return Trained(policy, critic, path)

@@ -1,0 +1,105 @@
+"""Train all of a study: dgae reproduce runs/paper --preset paper --scale 0.1
+
+Flags are checked before the rest is imported: JAX, MuJoCo and Brax take seconds to load.
+"""
+
+import dataclasses
+import shlex
+import sys
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from dgae_jax.cli import train
+from dgae_jax.cli.arguments import fail, parse_known
+from dgae_jax.configs.algorithms import TABLE
+from dgae_jax.configs.config import Config, ConfigError, invalid
+from dgae_jax.envs.registry import TASKS
+from dgae_jax.run import terminal
+from dgae_jax.run.options import RunOptions, to_dict
+from dgae_jax.study import matrix
+from dgae_jax.study.launch import LaunchOptions, launcher
+
+
+@dataclass(frozen=True)
+class Arguments:
+    """Which cells, and who trains them."""
+
+    study: tyro.conf.Positional[Path]
+    """Directory of the study, new or one to go on with [path]."""
+    preset: str = "tuned"
+    """Where the settings of every cell start: tuned (ours) or paper (its set-up)."""
+    config: Path | None = None
+    """A configuration, of a tuning for example, where they start instead; with one --algos [path]."""
+    envs: tuple[str, ...] = tuple(TASKS)
+    """Tasks."""
+    algos: tuple[str, ...] = tuple(TABLE)
+    """Algorithms."""
+    seeds: tuple[int, ...] = (0, 1, 2, 3, 4)
+    """Seeds [1]."""
+    scale: float = 1.0
+    """Fraction of the preset's samples [1]."""
+    seeds_per_run: int = 1
+    """Seeds that are trained side by side in one program: all of them is the fastest on a GPU, 1 on CPUs with native [runs]."""
+    launch: Annotated[LaunchOptions, tyro.conf.arg(name="")] = field(default_factory=LaunchOptions)
+
+
+def main() -> int:
+    """Train what is not done; 0 all done, 1 some failed, 2 bad input, 130 / 143 / 129 stopped by a signal."""
+    terminal.prepare()
+    try:
+        arguments, rest = parse_known(Arguments, "Train the cells of a study; every flag of dgae train may follow.", sys.argv[1:])
+        cells, options = _cells(arguments, rest)
+        launcher(arguments.launch)
+        with matrix.opened(arguments.study, cells, shlex.join(["dgae", "reproduce", *sys.argv[1:]])) as study:
+            from dgae_jax.study.reproduce import reproduce
+
+            return reproduce(study, cells, options, arguments.launch)
+    except ConfigError as mistake:
+        fail(mistake)
+    except KeyboardInterrupt:
+        terminal.warn("stopped by SIGINT before training began")
+        return 130
+
+
+def _cells(arguments: Arguments, rest: list[str]) -> tuple[list[matrix.Cell], RunOptions]:
+    """What the command line means; raises ConfigError for the first thing that is invalid."""
+    for name in ("envs", "algos", "seeds"):
+        given = getattr(arguments, name)
+        if not given or len(set(given)) < len(given):
+            raise invalid(name, given, "at least one, each once")
+    if not 0 < arguments.scale <= 1:
+        raise invalid("scale", arguments.scale, "above 0 and at most 1")
+    if not 1 <= arguments.seeds_per_run <= len(arguments.seeds):
+        raise invalid("seeds_per_run", arguments.seeds_per_run, f"a whole number from 1 to the number of seeds, {len(arguments.seeds)}")
+    if arguments.scale != 1 and any(word.partition("=")[0].replace("_", "-") == "--total-steps" for word in rest):
+        raise invalid("scale", arguments.scale, "left out with --total-steps")
+    if arguments.config and len(arguments.algos) > 1:
+        raise invalid("config", arguments.config, "used with one of --algos")
+    options = RunOptions()
+
+    def make(task: str, algo: str) -> Config:
+        nonlocal options
+        start = ["--config", str(arguments.config)] if arguments.config else ["--preset", arguments.preset]
+        config, options = train.parsed([*start, "--env", task, "--algo", algo, *rest])
+        _refuse(config, options)
+        return config if arguments.scale == 1 else dataclasses.replace(config, total_steps=int(arguments.scale * config.total_steps))
+
+    return matrix.matrix(arguments.envs, arguments.algos, arguments.seeds, arguments.seeds_per_run, make), options
+
+
+def _refuse(config: Config, options: RunOptions) -> None:
+    """What belongs to one run alone."""
+    if config.seed or config.num_seeds != 1:
+        name = "seed" if config.seed else "num_seeds"
+        raise invalid(name, getattr(config, name), "left out: --seeds and --seeds-per-run say which")
+    for name, usual in dataclasses.asdict(RunOptions(devices=options.devices)).items():
+        value = getattr(options, name)
+        if value != usual and name != "cache_dir" and name not in to_dict(options):
+            raise invalid(name, value, "left out: it is of one run alone")
+
+
+if __name__ == "__main__":
+    sys.exit(main())

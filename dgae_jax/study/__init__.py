@@ -1,0 +1,1 @@
+"""Many runs: which there are, who runs them, what came of them."""
