@@ -9,6 +9,7 @@ COMMANDS = {
     "train": "train a policy and write a run directory",
     "evaluate": "evaluate the policy of a run directory, or of a file",
     "reproduce": "train all of a study: tasks, algorithms and seeds",
+    "report": "figures, tables and one page from the results of studies",
 }
 """Each is a module of this room with a `main`."""
 

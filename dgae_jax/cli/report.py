@@ -1,0 +1,79 @@
+"""Report on studies: dgae report STUDY …
+
+Flags are checked before the rest is imported: Matplotlib takes a second to load.
+"""
+
+import os
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+
+import tyro
+
+from dgae_jax.cli.arguments import fail, parse
+from dgae_jax.configs.config import ConfigError, invalid
+from dgae_jax.run import terminal
+
+
+@dataclass(frozen=True)
+class Arguments:
+    """What to report on, and where to write it."""
+
+    studies: tyro.conf.Positional[tuple[Path, ...]]
+    """Directories of studies, or files of their results; several are compared with the first [paths]."""
+    out: Path | None = None
+    """Directory to write to; by default report in the directory of the first study [path]."""
+    published: bool = False
+    """Mark the results of docs/published.csv in the learning curves."""
+    markdown: Path | None = None
+    """A Markdown file in which the tables between `<!-- dgae report: NAME -->` and `<!-- /dgae report -->` are replaced; NAME is
+    returns, reach or speed [path]."""
+
+
+def main() -> int:
+    """Write a report; 0 done, 2 bad input, 130 stopped by SIGINT."""
+    terminal.prepare()
+    try:
+        return _report(parse(Arguments, "Figures, tables and one page of HTML from the results of studies."))
+    except ConfigError as mistake:
+        fail(mistake)
+    except KeyboardInterrupt:
+        terminal.warn("stopped by SIGINT, the report is not complete")
+        return 130
+
+
+def _report(arguments: Arguments) -> int:
+    """Everything that can be wrong is looked at before the first file is written."""
+    from dgae_jax.report import published, results
+
+    if not arguments.studies:
+        raise ConfigError("STUDIES: must be the directory of one study or more (--help lists every flag)")
+    if arguments.markdown and len(arguments.studies) > 1:
+        raise invalid("markdown", arguments.markdown, "left out where several studies are compared")
+    studies = [results.read(path) for path in arguments.studies]
+    out = arguments.out or studies[0].directory / "report"
+    _check_out(out)
+    known = published.read() if arguments.published else []
+    from dgae_jax.report import groups, markdown, write
+
+    if arguments.markdown:
+        markdown.blocks(arguments.markdown)
+    for path in write.write(studies, out, known):
+        terminal.say(f"written {path}")
+    if arguments.markdown:
+        names = markdown.replace(arguments.markdown, groups.groups_of(studies[0].rows))
+        terminal.say(f"written {arguments.markdown}: {', '.join(names)}")
+    return 0
+
+
+def _check_out(out: Path) -> None:
+    """Raise ConfigError unless a directory is there, or can be made, that can be written."""
+    if out.exists() and not out.is_dir():
+        raise invalid("out", out, "a directory")
+    nearest = next(path for path in (out.absolute(), *out.absolute().parents) if path.exists())
+    if not (nearest.is_dir() and os.access(nearest, os.W_OK)):
+        raise invalid("out", out, "a directory that can be written")
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,1 @@
+"""From the files of studies to what people read: statistics, figures, tables, one page."""

@@ -1,0 +1,102 @@
+"""The tables of a report, once as data and once as Markdown."""
+
+from collections.abc import Iterable, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from dgae_jax.report import analysis, statistics
+from dgae_jax.report.analysis import Estimate
+from dgae_jax.report.groups import Group, by_task
+
+NONE = "–"
+
+
+class Table(NamedTuple):
+    """Text in rows; the first column says what a row is about, as does the second where `keys` is 2."""
+
+    header: tuple[str, ...]
+    rows: list[tuple[str, ...]]
+    keys: int = 2
+
+
+def returns(groups: Iterable[Group]) -> Table:
+    """Final returns: mean ± standard deviation over seeds, interquartile mean with its interval, each seed's best
+    checkpoint, every seed.
+    """
+    header = ("task", "algorithm", "seeds", "mean ± std", "IQM [95 %]", "best checkpoint, mean ± std", "each seed")
+    return Table(header, [_returns(group) for group in groups])
+
+
+def _returns(group: Group) -> tuple[str, ...]:
+    best = [row.best for row in group.rows if row.best is not None]
+    return (
+        group.task, group.name, str(len(group.rows)), spread(group.finals), between(analysis.interquartile_mean(group)),
+        spread(best) if best else NONE, " · ".join(f"{value:,.0f}" for value in group.finals),
+    )  # fmt: skip
+
+
+def reach(groups: Iterable[Group]) -> Table:
+    """Samples after which the mean over seeds of the training return reaches shares of the best mean of the task."""
+    rows = []
+    for members in by_task(groups).values():
+        best = analysis.best_mean(members)
+        for group in members:
+            found = [NONE if steps is None else f"{steps:,}" for steps in analysis.reached(group, best)]
+            rows.append((group.task, group.name, NONE if best is None else f"{best:,.0f}", *found))
+    return Table(("task", "algorithm", "best mean", *(f"samples to {share:.0%}".replace("%", " %") for share in analysis.REACH)), rows)
+
+
+def speed(groups: Iterable[Group]) -> Table:
+    """Samples per second and wall-clock time of a run, mean ± standard deviation over seeds, and on what."""
+    rows = []
+    for group in groups:
+        devices = sorted({f"{row.machine.get('device', NONE)}, {row.machine.get('cores', NONE)} cores" for row in group.rows})
+        rates, seconds = ([getattr(row, name) for row in group.rows] for name in ("samples_per_second", "seconds"))
+        rows.append((group.task, group.name, spread(rates), spread(seconds), "; ".join(devices)))
+    return Table(("task", "algorithm", "samples per second", "seconds per run", "machine"), rows)
+
+
+def improvement(found: Iterable[analysis.Improvement]) -> Table:
+    """Probability of improvement with its interval."""
+    rows = [(duel.task, f"{duel.better.name} > {duel.worse.name}", between(duel.estimate, "{:.2f}")) for duel in found]
+    return Table(("task", "pair", "probability [95 %]"), rows)
+
+
+def comparison(first: Iterable[Group], second: Iterable[Group], names: tuple[str, str]) -> Table:
+    """Interquartile means of the final returns of two studies and their difference, second minus first."""
+    ours, theirs = ({(group.task, group.name): group for group in groups} for groups in (first, second))
+    rows = []
+    for key in {**ours, **theirs}:
+        both = [groups.get(key) for groups in (ours, theirs)]
+        cells = [NONE if group is None else between(analysis.interquartile_mean(group)) for group in both]
+        rows.append((*key, *cells, _difference(*both)))
+    return Table(("task", "algorithm", *(f"{name}, IQM [95 %]" for name in names), "difference [95 %]"), rows)
+
+
+def _difference(first: Group | None, second: Group | None) -> str:
+    if first is None or second is None:
+        return NONE
+    apart = analysis.estimate(statistics.difference(statistics.interquartile_mean), [first.finals], [second.finals])
+    return between(apart, "{:+,.0f}")
+
+
+def spread(values: Sequence[float]) -> str:
+    """Mean ± sample standard deviation."""
+    mean, std = statistics.mean_std(np.asarray(values, float))
+    return f"{mean:,.0f} ± {NONE if std is None else f'{std:,.0f}'}"
+
+
+def between(estimate: Estimate, form: str = "{:,.0f}") -> str:
+    """A value and its interval."""
+    if estimate.interval is None:
+        return f"{form.format(estimate.value)} [{NONE}]"
+    low, high = (form.format(end) for end in estimate.interval)
+    return f"{form.format(estimate.value)} [{low}, {high}]"
+
+
+def markdown(table: Table) -> str:
+    """The table in Markdown, numbers to the right."""
+    rule = ["---"] * table.keys + ["---:"] * (len(table.header) - table.keys)
+    lines = [table.header, rule, *table.rows]
+    return "\n".join("| " + " | ".join(cell.replace("|", "\\|") for cell in line) + " |" for line in lines)

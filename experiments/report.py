@@ -1,0 +1,8 @@
+"""Report on studies: python experiments/report.py STUDY …"""
+
+import sys
+
+from dgae_jax.cli.report import main
+
+if __name__ == "__main__":
+    sys.exit(main())

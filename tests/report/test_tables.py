@@ -1,0 +1,95 @@
+"""Tables, as data, as Markdown and inside documents."""
+
+import pytest
+
+from dgae_jax.configs.config import ConfigError
+from dgae_jax.report import markdown, tables
+from tests.report.rows import plain
+
+
+def test_final_returns_are_mean_std_iqm_best_and_each_seed(grouped):
+    best = {"best": {"steps": 5, "return_mean": 1500.0}}
+    rows = plain([1000, 3000], algo="ppo", **best) + plain([1234.5], algo="dppo", best=None)
+    assert tables.returns(grouped(rows)).rows == [
+        ("hopper-v4", "PPO", "2", "2,000 ± 1,414", "2,000 [1,000, 3,000]", "1,500 ± 0", "1,000 · 3,000"),
+        ("hopper-v4", "DPPO", "1", "1,234 ± –", "1,234 [–]", "–", "1,234"),
+    ]
+
+
+def test_samples_to_reach_are_whole_numbers_or_a_dash(grouped):
+    ppo = plain([1], algo="ppo", curve={"steps": [10, 2000], "return": [4, 100]})
+    dppo = plain([1], algo="dppo", curve={"steps": [10, 2000], "return": [None, 60]})
+    table = tables.reach(grouped(ppo + dppo))
+    assert table.header == ("task", "algorithm", "best mean", "samples to 50 %", "samples to 90 %")
+    assert table.rows == [("hopper-v4", "PPO", "100", "2,000", "2,000"), ("hopper-v4", "DPPO", "100", "2,000", "–")]
+
+
+def test_speed_is_samples_and_seconds_and_the_machine(grouped):
+    rows = plain([1, 2], samples_per_second=12_000.0, seconds=80.0)
+    assert tables.speed(grouped(rows)).rows == [("hopper-v4", "DPPO", "12,000 ± 0", "80 ± 0", "cpu: x, 1 cores")]
+
+
+def test_two_studies_are_compared_where_both_have_results(grouped):
+    first = grouped(plain([1, 3]) + plain([4], algo="ppo"))
+    second = grouped(plain([10, 10]) + plain([7, 7], algo="a2c"))
+    table = tables.comparison(first, second, ("A", "B"))
+    assert table.header == ("task", "algorithm", "A, IQM [95 %]", "B, IQM [95 %]", "difference [95 %]")
+    assert table.rows == [
+        ("hopper-v4", "PPO", "4 [–]", "–", "–"),
+        ("hopper-v4", "DPPO", "2 [1, 3]", "10 [10, 10]", "+8 [+7, +9]"),
+        ("hopper-v4", "A2C", "–", "7 [7, 7]", "–"),
+    ]
+
+
+def test_markdown_has_numbers_to_the_right_and_no_bars_inside_cells():
+    table = tables.Table(("task", "algorithm", "x"), [("a|b", "PPO", "1")])
+    assert tables.markdown(table) == "| task | algorithm | x |\n| --- | --- | ---: |\n| a\\|b | PPO | 1 |"
+
+
+DOCUMENT = """# Title
+<!-- dgae report: returns -->
+old
+<!-- /dgae report -->
+between
+<!-- dgae report: speed -->
+<!-- /dgae report -->
+end
+"""
+
+
+def test_every_block_of_a_document_is_replaced_and_the_rest_stays(grouped, tmp_path):
+    path, groups = tmp_path / "doc.md", grouped(plain([1, 3]))
+    path.write_text(DOCUMENT)
+    assert markdown.replace(path, groups) == ["returns", "speed"]
+    new = path.read_text()
+    assert new == DOCUMENT.replace("old\n", tables.markdown(tables.returns(groups)) + "\n").replace(
+        "speed -->\n", "speed -->\n" + tables.markdown(tables.speed(groups)) + "\n"
+    )
+    markdown.replace(path, groups)
+    assert path.read_text() == new
+
+
+@pytest.mark.parametrize(
+    ("text", "sentence"),
+    [
+        ("nothing", "a file with <!-- dgae report: NAME --> and <!-- /dgae report --> on lines of their own"),
+        ("<!-- dgae report: returns -->\n", "a file with <!-- /dgae report --> after the table returns"),
+        ("<!-- dgae report: returns -->\n<!-- dgae report: speed -->\n<!-- /dgae report -->",
+         "a file with <!-- /dgae report --> after the table returns"),
+        ("<!-- /dgae report -->\n", "a file without <!-- /dgae report --> where no table begins"),
+        ("<!-- dgae report: x -->\n<!-- /dgae report -->", "a file with tables named returns, reach, speed, not x"),
+    ],
+)  # fmt: skip
+def test_markers_that_do_not_match_are_refused(text, sentence, tmp_path):
+    path = tmp_path / "doc.md"
+    path.write_text(text)
+    with pytest.raises(ConfigError) as caught:
+        markdown.blocks(path)
+    assert str(caught.value) == f"markdown {path}: must be {sentence}"
+
+
+def test_a_document_that_cannot_be_read_is_refused(tmp_path):
+    (tmp_path / "bytes").write_bytes(b"\xff")
+    for name, reason in (("none", "No such file or directory"), ("bytes", "not text in UTF-8"), (".", "Is a directory")):
+        with pytest.raises(ConfigError, match=reason):
+            markdown.blocks(tmp_path / name)
