@@ -67,7 +67,7 @@ def good(tmp_path):
         (["{tmp}"], "error: {tmp}: must be the directory of a study, with study.json and results.jsonl"),
         (["{good}", "--out", "{good}/study.json"], "error: --out {good}/study.json: must be a directory"),
         (["{good}", "--out", "{good}/study.json/x"], "error: --out {good}/study.json/x: must be a directory that can be written"),
-        (["{good}", "--out", "/proc/x"], "error: --out /proc/x: must be a directory that can be written"),
+        (["{good}", "--out", "/proc/x"], "error: --out /proc/x: must be a directory that can be written (No such file or directory)"),
         (["{good}", "--markdown", "{tmp}/no.md"],
          "error: --markdown {tmp}/no.md: must be a file that can be read (No such file or directory)"),
         (["{good}", "--markdown", "{good}/study.json"], "error: --markdown {good}/study.json: must be a file with "

@@ -14,7 +14,7 @@ HEIGHT = {"ppo": 3000.0, "dppo": 3300.0, "trpo": 2400.0, "dtrpo": 2700.0, "a2c":
 
 def row(env="hopper", algo="dppo", seed=0, **changes):
     """One row; `changes` replace what is in it."""
-    config = to_dict(resolve(preset("tuned", algo, env)))
+    config = json.loads(json.dumps(to_dict(resolve(preset("tuned", algo, env)))))  # with lists for tuples, as in a file
     generator = np.random.default_rng([seed, ALGORITHMS.index(algo), len(env)])
     height = HEIGHT[algo] * generator.normal(1, 0.15)
     steps = np.linspace(5_000, 999_424, 120).astype(int)

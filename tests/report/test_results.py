@@ -90,7 +90,7 @@ def test_a_seed_that_is_there_twice_is_refused(tmp_path):
     ],
 )
 def test_a_field_that_is_wrong_is_named_with_what_it_must_be(change, sentence, tmp_path):
-    assert refusal(study(tmp_path, [row(**change)])) == f"{tmp_path}/results.jsonl line 1: {sentence}"
+    assert refusal(study(tmp_path, [row() | change])) == f"{tmp_path}/results.jsonl line 1: {sentence}"
 
 
 @pytest.mark.parametrize("name", [name for name in results.FIELDS if "." not in name])

@@ -1,7 +1,8 @@
-"""What several seeds say, against numbers worked out by hand and against rliable."""
+"""What several seeds say, against numbers worked out by hand and against SciPy."""
 
 import numpy as np
 import pytest
+from scipy import stats
 
 from dgae_jax.report import statistics as st
 
@@ -81,29 +82,35 @@ def scores():
     return generator.normal(1.0, 0.3, (10, 3)).round(1), generator.normal(0.9, 0.3, (8, 3)).round(1)
 
 
-def test_point_values_are_those_of_rliable(scores):
-    from rliable import library, metrics
-
+def test_point_values_are_those_of_scipy(scores):
     x, y = scores
-    assert st.interquartile_mean(list(x.T)) == pytest.approx(metrics.aggregate_iqm(x), rel=1e-14)
-    assert st.improvement(list(x.T), list(y.T)) == pytest.approx(metrics.probability_of_improvement(x, y), rel=1e-14)
+    assert st.interquartile_mean(list(x.T)) == pytest.approx(stats.trim_mean(x, 0.25, axis=None), rel=1e-14)
+    won = stats.mannwhitneyu(x, y).statistic / (len(x) * len(y))  # per task: pairs won, ties counted half
+    assert st.improvement(list(x.T), list(y.T)) == pytest.approx(won.mean(), rel=1e-14)
     taus = np.linspace(0, 2, 21)
-    np.testing.assert_allclose(st.performance_profile(list(x.T), taus), library.score_distributions(x, taus), rtol=1e-14)
+    above = 1 - stats.ecdf(x.ravel()).cdf.evaluate(taus)
+    np.testing.assert_allclose(st.performance_profile(list(x.T), taus), above, atol=1e-14)
 
 
-def test_intervals_are_those_of_rliable_up_to_chance(scores):
-    """Ends of 4,000 draws are sure to about 3 % of an interval's width; four such errors are allowed."""
-    from rliable import library, metrics
+def _iqm(*tasks, axis):
+    return stats.trim_mean(np.concatenate(tasks, axis), 0.25, axis=axis)
 
-    x, y = scores
-    np.random.seed(0)  # noqa: NPY002  rliable draws from it
-    _, whole = library.get_interval_estimates({"x": x}, lambda s: np.array([metrics.aggregate_iqm(s)]), reps=4000)
-    _, pair = library.get_interval_estimates({"xy": [x, y]}, lambda a, b: np.array([metrics.probability_of_improvement(a, b)]), reps=4000)
-    for theirs, ours in (
-        (whole["x"][:, 0], st.interval(st.interquartile_mean, list(x.T))),
-        (pair["xy"][:, 0], st.interval(st.improvement, list(x.T), list(y.T))),
-    ):
-        np.testing.assert_allclose(ours, theirs, atol=0.12 * (theirs[1] - theirs[0]))
+
+def _wins(*tasks, axis):
+    half = len(tasks) // 2
+    pairs = zip(tasks[:half], tasks[half:], strict=True)
+    return np.mean([stats.mannwhitneyu(x, y, axis=axis).statistic / (x.shape[axis] * y.shape[axis]) for x, y in pairs], axis=0)
+
+
+@pytest.mark.parametrize("theirs", [_iqm, _wins])
+def test_intervals_are_those_of_scipys_bootstrap_up_to_chance(theirs, scores):
+    """Tasks are SciPy's independent samples. The ends are sure to about 2 % of an interval's width; four such errors are allowed."""
+    x, y = (list(each.T) for each in scores)
+    samples, ours = ((x,), st.interquartile_mean) if theirs is _iqm else ((x, y), st.improvement)
+    known = stats.bootstrap(
+        sum(samples, []), theirs, n_resamples=5000, method="percentile", vectorized=True, rng=np.random.default_rng(7), batch=500
+    ).confidence_interval
+    np.testing.assert_allclose(st.interval(ours, *samples), known, atol=0.08 * (known.high - known.low))
 
 
 def test_curves_are_compared_at_the_steps_that_all_of_them_cover():
