@@ -3,22 +3,22 @@
 import io
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.lines import Line2D
 from matplotlib.ticker import EngFormatter, PercentFormatter
 
+from dgae_jax.configs.algorithms import TABLE
 from dgae_jax.report import analysis, statistics
 from dgae_jax.report.groups import Group, by_task
 from dgae_jax.report.published import Published
 from dgae_jax.report.style import FAINT, INK, OTHER, Look, look
 from dgae_jax.run import files
 
-PANEL = (4.8, 3.4)
+PANEL = (4.5, 3.3)
 """Size of a panel [inches]: its text is legible on a phone, where a panel is as wide as the screen."""
 
 LOOK = {
@@ -51,12 +51,13 @@ def _curves(axes: Axes, task: str, members: Sequence[Group], published: Sequence
         style, mean, std = look(group.algo, group.number), curve.mean(0), curve.std(0, ddof=min(1, len(curve) - 1))
         axes.plot(steps, mean, style.line, color=style.colour, marker=style.marker, markevery=0.1, markersize=4, label=group.name)
         axes.fill_between(steps, mean - std, mean + std, color=style.colour, alpha=0.12, linewidth=0)
-    env, end = members[0].rows[0].env, max((row.total_steps for group in members for row in group.rows), default=0)
-    for mark in (m for m in published if m.task == env and m.samples <= end):
-        axes.errorbar(mark.samples, mark.mean, mark.spread, fmt="x", color=OTHER, markersize=5, capsize=2, linewidth=1, label="published")
-        text = f"{mark.algorithm} "
-        axes.annotate(
-            text, (mark.samples, mark.mean), color=INK, ha="right", va="center", fontsize=7, xytext=(-3, 0), textcoords="offset points"
+    end = max(row.total_steps for group in members for row in group.rows)
+    marks = [mark for mark in published if mark.task == members[0].rows[0].env and mark.samples <= end]
+    for number, mark in enumerate(marks):  # beside each other, a little to the right of their samples
+        known = mark.algorithm.lower() in TABLE
+        style = {"color": look(mark.algorithm.lower()).colour if known else OTHER, "label": f"{mark.algorithm}, published"}
+        axes.errorbar(
+            mark.samples + (1 + number) * 0.015 * end, mark.mean, mark.spread, fmt="x", markersize=5, capsize=2, linewidth=1, **style
         )
     axes.set(title=task, xlabel="environment steps", ylabel="episode return")
     axes.xaxis.set_major_formatter(EngFormatter(sep=""))
@@ -85,7 +86,7 @@ def speed(groups: Iterable[Group]) -> Figure:
             axes, [Mark(g.name, look(g.algo, g.number), analysis.Estimate(r.mean(), None), r) for g, r in zip(members, rates, strict=True)]
         )
         axes.set(title=task, xlabel="samples per second")
-        axes.set_xlim(left=0)
+        axes.set_xlim(0, 1.1 * max(rate.max() for rate in rates))
         axes.xaxis.set_major_formatter(EngFormatter(sep=""))
 
     return _panels(groups, panel, _height(max(map(len, by_task(groups).values()))), legend=False)
@@ -152,6 +153,7 @@ def _panels(groups: Iterable[Group], draw: Callable[[Axes, str, Sequence[Group]]
     rows = -(-len(tasks) // columns)
     with mpl.rc_context(LOOK):
         figure = Figure(figsize=(columns * PANEL[0], rows * height + 0.5 * legend), layout="constrained", dpi=150)
+        figure.get_layout_engine().set(h_pad=0.1)
         panels = list(figure.subplots(rows, columns, squeeze=False).flat)
         for axes, (task, members) in zip(panels, tasks.items(), strict=False):
             draw(axes, task, members)
@@ -163,13 +165,17 @@ def _panels(groups: Iterable[Group], draw: Callable[[Axes, str, Sequence[Group]]
 
 
 def _legend(figure: Figure, panels: Sequence[Axes]) -> None:
-    """Every label once, below the panels."""
-    handles: dict[str, Line2D] = {}
+    """Every label once, below the panels; what has the same colour together, so that pairs stand in columns."""
+    handles: dict[str, tuple[str, Any]] = {}
     for axes in panels:
         for handle, label in zip(*axes.get_legend_handles_labels(), strict=True):
-            handles.setdefault(label, handle)
-    if handles:
-        figure.legend(list(handles.values()), list(handles), loc="outside lower center", ncols=min(3, len(handles)), handlelength=2.6)
+            line = handle[0] if isinstance(handle, tuple) else handle  # of an error bar, its cross
+            handles.setdefault(label, (line.get_color(), handle))
+    colours = list(dict.fromkeys(colour for colour, _ in handles.values()))
+    ordered = sorted(handles.items(), key=lambda item: colours.index(item[1][0]))
+    if ordered:
+        labels, shown = [label for label, _ in ordered], [handle for _, (_, handle) in ordered]
+        figure.legend(shown, labels, loc="outside lower center", ncols=min(3, len(labels)), handlelength=2.6)
 
 
 def svg(figure: Figure) -> bytes:

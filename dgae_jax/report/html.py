@@ -7,6 +7,9 @@ from html import escape
 
 from dgae_jax.report.tables import Table
 
+KEY = ' class="key"'
+"""Of cells that say what a row is about."""
+
 
 def heading(level: int, text: str, anchor: str) -> str:
     """A heading that links can lead to."""
@@ -21,9 +24,12 @@ def paragraph(text: str, kind: str = "") -> str:
 def table(content: Table, marked: Iterable[tuple[int, int]] = ()) -> str:
     """A table that scrolls inside its box; `marked` are (row, column) to highlight."""
     marked = set(marked)
-    head = "".join(f'<th scope="col">{escape(cell)}</th>' for cell in content.header)
+    head = "".join(f'<th scope="col"{KEY if x < content.keys else ""}>{escape(cell)}</th>' for x, cell in enumerate(content.header))
+    above = ["", *(row[0] for row in content.rows)]
     body = "".join(
-        "<tr>" + "".join(_cell(text, column < content.keys, (y, column) in marked) for column, text in enumerate(row)) + "</tr>"
+        ('<tr class="next">' if row[0] != above[y] and content.keys > 1 else "<tr>")
+        + "".join(_cell(text, column < content.keys, (y, column) in marked) for column, text in enumerate(row))
+        + "</tr>"
         for y, row in enumerate(content.rows)
     )
     label = escape(", ".join(content.header))
@@ -35,7 +41,7 @@ def table(content: Table, marked: Iterable[tuple[int, int]] = ()) -> str:
 
 def _cell(text: str, key: bool, marked: bool) -> str:
     inside = f"<mark>{escape(text)}</mark>" if marked else escape(text)
-    return f'<th scope="row">{inside}</th>' if key else f"<td>{inside}</td>"
+    return f'<th scope="row"{KEY}>{inside}</th>' if key else f"<td>{inside}</td>"
 
 
 def picture(svg: bytes, alt: str) -> str:

@@ -76,9 +76,9 @@ def _returns(content: Content) -> str:
     engines = " and ".join(sorted({row.engine for row in content.study.rows}))
     note = (
         f"Mean return of the last deterministic policy, evaluated in {engines}: mean ± sample standard deviation over seeds, and the"
-        " interquartile mean (IQM) with its 95 % interval by the stratified bootstrap. The best checkpoint is the best of each seed's"
-        " evaluations along the way, which favours it. In the pictures the dot is the IQM, the bar its interval, ticks are seeds; dots"
-        " of scalar critics are hollow."
+        " interquartile mean (IQM) with its 95 % interval by the stratified bootstrap. Best checkpoint: mean ± deviation of the best of"
+        " each seed's evaluations along the way, which are chosen by what they are judged by. In the pictures the dot is the IQM, the bar its"
+        " interval, ticks are seeds; dots of scalar critics are hollow."
     )
     return html.table(tables.returns(content.groups)) + html.gallery(pictures, note)
 
@@ -97,7 +97,7 @@ def _curves(content: Content) -> str:
         pictures.append(html.picture(figures.svg(figure), alt))
     note = (
         "Undiscounted episode return while training, mean and standard deviation over seeds. Solid: with a value distribution; dashed: with"
-        " a scalar critic." + (" Crosses are published results at their number of samples." if content.published else "")
+        " a scalar critic." + (" Crosses are published results, beside their number of samples." if content.published else "")
     )
     return html.gallery(pictures, note)
 

@@ -24,7 +24,7 @@ def returns(groups: Iterable[Group]) -> Table:
     """Final returns: mean ± standard deviation over seeds, interquartile mean with its interval, each seed's best
     checkpoint, every seed.
     """
-    header = ("task", "algorithm", "seeds", "mean ± std", "IQM [95 %]", "best checkpoint, mean ± std", "each seed")
+    header = ("task", "algorithm", "seeds", "mean ± std", "IQM [95 %]", "best checkpoint", "each seed")
     return Table(header, [_returns(group) for group in groups])
 
 

@@ -27,7 +27,8 @@ def seen(text, directory):
     """Width of the viewport and of the page, images, images that are broken; and messages of the console."""
     (directory / "page.html").write_text(text)
     (directory / "frame.html").write_text(FRAME)
-    argv = ["--headless", "--no-sandbox", "--disable-gpu", "--hide-scrollbars", "--allow-file-access-from-files", f"--user-data-dir={directory / 'profile'}",
+    argv = ["--headless", "--no-sandbox", "--disable-gpu", "--hide-scrollbars", "--allow-file-access-from-files",
+            f"--user-data-dir={directory / 'profile'}",
             "--enable-logging=stderr", "--virtual-time-budget=5000", "--dump-dom", (directory / "frame.html").as_uri()]  # fmt: skip
     done = subprocess.run([CHROMIUM, *argv], capture_output=True, text=True, timeout=120, check=True)
     numbers = re.search(r'data-seen="([^"]*)"', done.stdout)

@@ -54,8 +54,9 @@ def test_published_results_are_marked_where_the_task_and_the_budget_have_them(gr
     ]
     (axes,) = figures.learning_curves(grouped([row()]), known).axes
     crosses = [line.get_xydata().tolist() for line in axes.lines if line.get_marker() == "x"]
-    assert crosses == [[[1_000_000, 2609]]]
-    assert [text.get_text().strip() for text in axes.texts] == ["PPO"]
+    assert crosses == [[[1_015_000, 2609]]]  # beside its samples
+    (legend,) = axes.figure.legends
+    assert [text.get_text() for text in legend.get_texts()] == ["DPPO", "PPO, published"]
 
 
 def test_final_returns_are_dots_at_the_iqm_bars_of_the_interval_and_ticks_of_the_seeds(grouped):

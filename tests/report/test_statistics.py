@@ -108,7 +108,13 @@ def test_intervals_are_those_of_scipys_bootstrap_up_to_chance(theirs, scores):
     x, y = (list(each.T) for each in scores)
     samples, ours = ((x,), st.interquartile_mean) if theirs is _iqm else ((x, y), st.improvement)
     known = stats.bootstrap(
-        sum(samples, []), theirs, n_resamples=5000, method="percentile", vectorized=True, rng=np.random.default_rng(7), batch=500
+        [task for strata in samples for task in strata],
+        theirs,
+        n_resamples=5000,
+        method="percentile",
+        vectorized=True,
+        rng=np.random.default_rng(7),
+        batch=500,
     ).confidence_interval
     np.testing.assert_allclose(st.interval(ours, *samples), known, atol=0.08 * (known.high - known.low))
 
