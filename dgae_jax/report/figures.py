@@ -21,7 +21,7 @@ from dgae_jax.run import files
 PANEL = (4.5, 3.3)
 """Size of a panel [inches]: its text is legible on a phone, where a panel is as wide as the screen."""
 
-LOOK = {
+LOOK: dict[Any, Any] = {
     "font.size": 9, "axes.titlesize": 10, "axes.spines.top": False, "axes.spines.right": False, "axes.edgecolor": FAINT, "axes.grid": True,
     "grid.alpha": 0.3, "text.color": INK, "axes.labelcolor": INK, "xtick.color": INK, "ytick.color": INK, "legend.frameon": False,
     "svg.fonttype": "none", "svg.hashsalt": "dgae", "lines.linewidth": 1.6,
@@ -55,10 +55,9 @@ def _curves(axes: Axes, task: str, members: Sequence[Group], published: Sequence
     marks = [mark for mark in published if mark.task == members[0].rows[0].env and mark.samples <= end]
     for number, mark in enumerate(marks):  # beside each other, a little to the right of their samples
         known = mark.algorithm.lower() in TABLE
-        style = {"color": look(mark.algorithm.lower()).colour if known else OTHER, "label": f"{mark.algorithm}, published"}
-        axes.errorbar(
-            mark.samples + (1 + number) * 0.015 * end, mark.mean, mark.spread, fmt="x", markersize=5, capsize=2, linewidth=1, **style
-        )
+        colour, at = look(mark.algorithm.lower()).colour if known else OTHER, mark.samples + (1 + number) * 0.015 * end
+        label = f"{mark.algorithm}, published"
+        axes.errorbar(at, mark.mean, mark.spread, fmt="x", markersize=5, capsize=2, linewidth=1, color=colour, label=label)
     axes.set(title=task, xlabel="environment steps", ylabel="episode return")
     axes.xaxis.set_major_formatter(EngFormatter(sep=""))
     axes.margins(x=0.02)
@@ -153,7 +152,7 @@ def _panels(groups: Iterable[Group], draw: Callable[[Axes, str, Sequence[Group]]
     rows = -(-len(tasks) // columns)
     with mpl.rc_context(LOOK):
         figure = Figure(figsize=(columns * PANEL[0], rows * height + 0.5 * legend), layout="constrained", dpi=150)
-        figure.get_layout_engine().set(h_pad=0.1)
+        figure.set_layout_engine("constrained", h_pad=0.1)
         panels = list(figure.subplots(rows, columns, squeeze=False).flat)
         for axes, (task, members) in zip(panels, tasks.items(), strict=False):
             draw(axes, task, members)
@@ -175,7 +174,7 @@ def _legend(figure: Figure, panels: Sequence[Axes]) -> None:
     ordered = sorted(handles.items(), key=lambda item: colours.index(item[1][0]))
     if ordered:
         labels, shown = [label for label, _ in ordered], [handle for _, (_, handle) in ordered]
-        figure.legend(shown, labels, loc="outside lower center", ncols=min(3, len(labels)), handlelength=2.6)
+        figure.legend(shown, labels, loc="outside lower center", ncols=min(3, len(labels)), fontsize=8, handlelength=2.4, columnspacing=1.2)
 
 
 def svg(figure: Figure) -> bytes:

@@ -46,7 +46,7 @@ class Group:
 def groups_of(rows: Iterable[Row]) -> list[Group]:
     """All groups, by task and algorithm in the order of their tables, then by the name of their first cell."""
     by_kind: dict[tuple[str, str], dict[str, list[Row]]] = {}
-    for row in sorted(rows, key=_order):
+    for row in sorted(rows, key=order):
         by_kind.setdefault((row.task, row.algo), {}).setdefault(row.hash, []).append(row)
     return [
         Group(task, algo, _variant(next(iter(variants.values()))[0], members[0]) if number else "", number, tuple(members))
@@ -74,7 +74,8 @@ def shown(value: Any) -> str:
     return " ".join(map(str, value)) if isinstance(value, list) else "–" if value is None else str(value)
 
 
-def _order(row: Row) -> tuple:
+def order(row: Row) -> tuple:
+    """What rows are sorted by: task, algorithm, cell, seed."""
     tasks = list(TASKS)
     place = tasks.index(row.env) if row.env in tasks else len(tasks)
     return place, row.task, list(TABLE).index(row.algo), row.cell, row.seed

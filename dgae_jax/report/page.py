@@ -77,8 +77,8 @@ def _returns(content: Content) -> str:
     note = (
         f"Mean return of the last deterministic policy, evaluated in {engines}: mean ± sample standard deviation over seeds, and the"
         " interquartile mean (IQM) with its 95 % interval by the stratified bootstrap. Best checkpoint: mean ± deviation of the best of"
-        " each seed's evaluations along the way, which are chosen by what they are judged by. In the pictures the dot is the IQM, the bar its"
-        " interval, ticks are seeds; dots of scalar critics are hollow."
+        " each seed's evaluations along the way, which are chosen by what they are judged by. In the pictures the dot is the IQM, the"
+        " bar its interval, ticks are seeds; dots of scalar critics are hollow."
     )
     return html.table(tables.returns(content.groups)) + html.gallery(pictures, note)
 

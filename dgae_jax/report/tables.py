@@ -7,7 +7,7 @@ import numpy as np
 
 from dgae_jax.report import analysis, statistics
 from dgae_jax.report.analysis import Estimate
-from dgae_jax.report.groups import Group, by_task
+from dgae_jax.report.groups import Group, by_task, order
 
 NONE = "–"
 
@@ -32,7 +32,7 @@ def _returns(group: Group) -> tuple[str, ...]:
     best = [row.best for row in group.rows if row.best is not None]
     return (
         group.task, group.name, str(len(group.rows)), spread(group.finals), between(analysis.interquartile_mean(group)),
-        spread(best) if best else NONE, " · ".join(f"{value:,.0f}" for value in group.finals),
+        spread(best) if best else NONE, " · ".join(number(value) for value in group.finals),
     )  # fmt: skip
 
 
@@ -66,8 +66,8 @@ def improvement(found: Iterable[analysis.Improvement]) -> Table:
 def comparison(first: Iterable[Group], second: Iterable[Group], names: tuple[str, str]) -> Table:
     """Interquartile means of the final returns of two studies and their difference, second minus first."""
     ours, theirs = ({(group.task, group.name): group for group in groups} for groups in (first, second))
-    rows = []
-    for key in {**ours, **theirs}:
+    rows, either = [], {**ours, **theirs}
+    for key in sorted(either, key=lambda key: order(either[key].rows[0])):
         both = [groups.get(key) for groups in (ours, theirs)]
         cells = [NONE if group is None else between(analysis.interquartile_mean(group)) for group in both]
         rows.append((*key, *cells, _difference(*both)))
@@ -81,18 +81,21 @@ def _difference(first: Group | None, second: Group | None) -> str:
     return between(apart, "{:+,.0f}")
 
 
-def spread(values: Sequence[float]) -> str:
+def number(value: float, form: str = "{:,.0f}") -> str:
+    """A number as it is printed."""
+    return form.format(value).replace("-", "−")
+
+
+def spread(values: Sequence[float] | np.ndarray) -> str:
     """Mean ± sample standard deviation."""
     mean, std = statistics.mean_std(np.asarray(values, float))
-    return f"{mean:,.0f} ± {NONE if std is None else f'{std:,.0f}'}"
+    return f"{number(mean)} ± {NONE if std is None else number(std)}"
 
 
 def between(estimate: Estimate, form: str = "{:,.0f}") -> str:
     """A value and its interval."""
-    if estimate.interval is None:
-        return f"{form.format(estimate.value)} [{NONE}]"
-    low, high = (form.format(end) for end in estimate.interval)
-    return f"{form.format(estimate.value)} [{low}, {high}]"
+    ends = () if estimate.interval is None else estimate.interval
+    return f"{number(estimate.value, form)} [{', '.join(number(end, form) for end in ends) or NONE}]"
 
 
 def markdown(table: Table) -> str:

@@ -107,15 +107,8 @@ def test_intervals_are_those_of_scipys_bootstrap_up_to_chance(theirs, scores):
     """Tasks are SciPy's independent samples. The ends are sure to about 2 % of an interval's width; four such errors are allowed."""
     x, y = (list(each.T) for each in scores)
     samples, ours = ((x,), st.interquartile_mean) if theirs is _iqm else ((x, y), st.improvement)
-    known = stats.bootstrap(
-        [task for strata in samples for task in strata],
-        theirs,
-        n_resamples=5000,
-        method="percentile",
-        vectorized=True,
-        rng=np.random.default_rng(7),
-        batch=500,
-    ).confidence_interval
+    tasks, how = [task for strata in samples for task in strata], {"method": "percentile", "vectorized": True, "batch": 500}
+    known = stats.bootstrap(tasks, theirs, n_resamples=5000, rng=np.random.default_rng(7), **how).confidence_interval
     np.testing.assert_allclose(st.interval(ours, *samples), known, atol=0.08 * (known.high - known.low))
 
 
