@@ -62,10 +62,15 @@ def _summary(content: Content) -> str:
     rows, missing = content.study.rows, content.study.missing
     seeds, steps = len({row.seed for row in rows}), sorted({row.total_steps for row in rows})
     budget = f"{steps[0]:,}" if len(steps) == 1 else f"{steps[0]:,} to {steps[-1]:,}"
-    algorithms = len({group.algo for group in content.groups})
-    text = f"{len(rows)} trained runs: {len(content.tasks)} tasks, {algorithms} algorithms, {seeds} seeds, {budget} environment steps each."
+    counts = {"task": len(content.tasks), "algorithm": len({group.algo for group in content.groups}), "seed": seeds}
+    told = ", ".join(_count(number, noun) for noun, number in counts.items())
+    text = f"{_count(len(rows), 'trained run')}: {told}, {budget} environment steps each."
     some = ", ".join(missing[:10]) + (f" and {len(missing) - 10} more" if len(missing) > 10 else "")
     return text + (f" Cells without a result: {some}." if missing else "")
+
+
+def _count(number: int, noun: str) -> str:
+    return f"{number} {noun}" + "s" * (number != 1)
 
 
 def _returns(content: Content) -> str:
@@ -99,7 +104,9 @@ def _curves(content: Content) -> str:
         "Undiscounted episode return while training, mean and standard deviation over seeds. Solid: with a value distribution; dashed: with"
         " a scalar critic." + (" Crosses are published results, beside their number of samples." if content.published else "")
     )
-    return html.gallery(pictures, note)
+    known = [one for one in content.published if one.task in {row.env for row in content.study.rows}]
+    sources = html.details("Published results", html.table(tables.others(known))) if known else ""
+    return html.gallery(pictures, note) + sources
 
 
 def _improvement(content: Content) -> str:
@@ -118,7 +125,9 @@ def _profile(content: Content) -> str:
     scores = analysis.normalised(content.groups)
     if not scores:
         return ""
-    runs = ", ".join(f"{name} {sum(map(len, strata))} runs of {len(strata)} tasks" for name, (_, strata) in scores.items())
+    runs = ", ".join(
+        f"{name} {_count(sum(map(len, strata)), 'run')} of {_count(len(strata), 'task')}" for name, (_, strata) in scores.items()
+    )
     note = f"Share of runs whose final return, over the best mean of the task, is above τ; the shade is its 95 % interval. {runs}."
     alt = f"Performance profiles of {', '.join(scores)}."
     return html.gallery([html.picture(figures.svg(figures.performance_profile(content.groups)), alt)], note)

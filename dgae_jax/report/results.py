@@ -68,7 +68,7 @@ class Study:
     @property
     def name(self) -> str:
         """Of the directory."""
-        return self.directory.absolute().name
+        return self.directory.resolve().name
 
     @property
     def directory(self) -> Path:

@@ -8,6 +8,7 @@ import numpy as np
 from dgae_jax.report import analysis, statistics
 from dgae_jax.report.analysis import Estimate
 from dgae_jax.report.groups import Group, by_task, order
+from dgae_jax.report.published import Published
 
 NONE = "–"
 
@@ -61,6 +62,15 @@ def improvement(found: Iterable[analysis.Improvement]) -> Table:
     """Probability of improvement with its interval."""
     rows = [(duel.task, f"{duel.better.name} > {duel.worse.name}", between(duel.estimate, "{:.2f}")) for duel in found]
     return Table(("task", "pair", "probability [95 %]"), rows)
+
+
+def others(results: Iterable[Published]) -> Table:
+    """Published results and where they are from."""
+    rows = []
+    for one in results:
+        value = number(one.mean) + ("" if one.spread is None else f" ± {number(one.spread)}")
+        rows.append((one.task, one.algorithm, f"{one.samples:,}", value, NONE if one.seeds is None else str(one.seeds), one.source))
+    return Table(("task", "algorithm", "samples", "mean ± spread", "seeds", "source"), rows)
 
 
 def comparison(first: Iterable[Group], second: Iterable[Group], names: tuple[str, str]) -> Table:

@@ -8,6 +8,7 @@ import pytest
 
 from dgae_jax.report import results
 from dgae_jax.report.page import PARTS, page
+from dgae_jax.report.published import Published
 from tests.report.rows import plain, row, study, whole
 
 VOID = {"meta", "img", "br", "link", "input", "hr"}
@@ -111,6 +112,7 @@ def test_cells_without_a_result_are_named(tmp_path):
 
 def test_one_seed_has_dashes_for_intervals_and_one_algorithm_no_pairs(read):
     _, found = read([row()])
+    assert "1 trained run: 1 task, 1 algorithm, 1 seed, 1,000,000 environment steps each." in found.words
     assert any(word.endswith("[–]") for word in found.words)
     assert "Probability of improvement" not in found.words
 
@@ -122,6 +124,13 @@ def test_a_video_of_a_task_is_in_the_page(tmp_path):
         (path / "videos" / f"{name}.mp4").write_bytes(name.encode())
     films = Reader(page([results.read(path)])).all("video")
     assert [base64.b64decode(film["src"].removeprefix("data:video/mp4;base64,")) for film in films] == [b"hopper", b"brax-ant"]
+
+
+def test_published_results_are_listed_with_their_sources(tmp_path):
+    known = [Published("hopper", 10**6, "PPO", 2609.0, 701.0, 10, "Tianshou"), Published("ant", 10**6, "PPO", 3258.0, None, None, "Other")]
+    words = Reader(page([results.read(study(tmp_path / "one", [row()]))], known)).words
+    assert words[words.index("2,609 ± 701") : words.index("Tianshou") + 1] == ["2,609 ± 701", "10", "Tianshou"]
+    assert "Other" not in words  # a task that the study does not have
 
 
 def test_two_studies_are_compared_first_and_then_told_one_after_the_other(read):
