@@ -4,7 +4,7 @@ import argparse
 import contextlib
 import io
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any, NoReturn, TypeVar
 
 import tyro
@@ -13,7 +13,6 @@ from dgae_jax.configs.config import ConfigError, flag
 from dgae_jax.run import terminal
 
 T = TypeVar("T")
-R = TypeVar("R")
 
 _FRAME = re.compile(r"[╭╮╰╯├┤│─+|\- ]*")  # tyro draws it in ASCII where the terminal has no more
 
@@ -39,19 +38,22 @@ def peek(argv: Sequence[str], *names: str) -> dict[str, str | None]:
 def parse(cls: type[T], description: str, argv: Sequence[str] | None = None, default: T | None = None) -> T:
     """The dataclass `cls` filled from the command line, over `default`; `--help` explains every field."""
     over: dict[str, Any] = {} if default is None else {"default": default}
-    return _parsed(lambda: tyro.cli(cls, description=description, args=argv, **over))
+    with _mistakes_in_one_line():
+        return tyro.cli(cls, description=description, args=argv, **over)
 
 
 def parse_known(cls: type[T], description: str, argv: Sequence[str]) -> tuple[T, list[str]]:
-    """The same from what `cls` has fields for, and the rest of the command line."""
-    return _parsed(lambda: tyro.cli(cls, description=description, args=argv, return_unknown_args=True))
+    """`parse` for a command line that says more: the dataclass, and the words that are not its own."""
+    with _mistakes_in_one_line():
+        return tyro.cli(cls, description=description, args=argv, return_unknown_args=True)
 
 
-def _parsed(parser: Callable[[], R]) -> R:
+@contextlib.contextmanager
+def _mistakes_in_one_line() -> Iterator[None]:
     screen = io.StringIO()
     try:
         with contextlib.redirect_stderr(screen):
-            return parser()
+            yield
     except SystemExit as stop:
         if stop.code in (0, None):
             raise

@@ -10,6 +10,7 @@ COMMANDS = {
     "evaluate": "evaluate the policy of a run directory, or of a file",
     "reproduce": "train all of a study: tasks, algorithms and seeds",
     "report": "figures, tables and one page from the results of studies",
+    "tune": "search for the settings with the highest return",
 }
 """Each is a module of this room with a `main`."""
 

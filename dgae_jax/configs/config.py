@@ -36,12 +36,18 @@ class _Settings:
     """Values in the form that compiles once: whole numbers given for floats become floats, and lists tuples."""
 
     def __post_init__(self):
+        floats = floats_of(type(self))
         for f in fields(self):  # pyright: ignore[reportArgumentType]
             value = getattr(self, f.name)
-            if f.type in (float, float | None) and type(value) is int:
+            if f.name in floats and type(value) is int:
                 object.__setattr__(self, f.name, float(value))
             if isinstance(value, list):
                 object.__setattr__(self, f.name, tuple(value))
+
+
+def floats_of(cls: type) -> list[str]:
+    """The fields that are floats, also where they may be unset."""
+    return [f.name for f in fields(cls) if f.type in (float, float | None)]
 
 
 @dataclass(frozen=True)

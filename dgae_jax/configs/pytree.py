@@ -7,11 +7,11 @@ import dataclasses
 
 import jax
 
-from dgae_jax.configs.config import Config, CriticConfig, PolicyConfig
+from dgae_jax.configs.config import Config, CriticConfig, PolicyConfig, floats_of
 
 
 def _register(cls: type, *more: str) -> None:
-    floats = [f.name for f in dataclasses.fields(cls) if f.type in (float, float | None)]
+    floats = floats_of(cls)
     static = [f.name for f in dataclasses.fields(cls) if f.name not in (*floats, *more)]
     jax.tree_util.register_dataclass(cls, data_fields=[*floats, *more], meta_fields=static)
 

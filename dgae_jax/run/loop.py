@@ -16,7 +16,7 @@ from dgae_jax.run import checkpoint, compiling, directory, hosts, machine, manif
 from dgae_jax.run.evaluations import EvaluationsFile
 from dgae_jax.run.options import RunOptions, validate_options
 from dgae_jax.run.summary import describe
-from dgae_jax.run.training import RunError, run_to_end
+from dgae_jax.run.training import Heed, RunError, run_to_end, unheeded
 
 
 class Finished(NamedTuple):
@@ -27,20 +27,20 @@ class Finished(NamedTuple):
     directory: Path
 
 
-def start(config: Config, options: RunOptions) -> Finished:
+def start(config: Config, options: RunOptions, heed: Heed = unheeded) -> Finished:
     """Train, evaluate, and write a new run directory.
 
     Raises ConfigError before anything is written or compiled if the configuration or a path is invalid, RunError if the run
-    ends early.
+    ends early, and what `heed` raises at an evaluation.
     """
     config, options = _prepared(config, options)
     with hosts.writing(options.run_dir or directory.default_path(config)) as run_dir:
         directory.create(run_dir, config, options)
         with directory.locked(run_dir):
-            return Finished(run_to_end(config, options, run_dir, None), run_dir)
+            return Finished(run_to_end(config, options, run_dir, None, heed), run_dir)
 
 
-def go_on(config: Config, options: RunOptions) -> Finished:
+def go_on(config: Config, options: RunOptions, heed: Heed = unheeded) -> Finished:
     """Continue the run in `options.resume` from its newest whole checkpoint, as if it had never stopped.
 
     Raises as `start`; ConfigError also, naming both values, for a setting other than `total_steps` that differs from the run's,
@@ -50,16 +50,16 @@ def go_on(config: Config, options: RunOptions) -> Finished:
     assert options.resume is not None
     _compare(config, directory.read_config(options.resume), options.resume, options)
     with hosts.writing(options.resume) as run_dir, directory.locked(run_dir):
-        return Finished(run_to_end(config, options, run_dir, _last_state(run_dir, config)), run_dir)
+        return Finished(run_to_end(config, options, run_dir, _last_state(run_dir, config), heed), run_dir)
 
 
-def go_on_or_start(config: Config, options: RunOptions) -> Finished:
+def go_on_or_start(config: Config, options: RunOptions, heed: Heed = unheeded) -> Finished:
     """`go_on` in `options.run_dir` if a run was begun there, `start` otherwise; raises as they do."""
     validate_options(options)
     hosts.join(options)
     if options.run_dir is not None and hosts.first(directory.has_begun(options.run_dir)):
-        return go_on(config, dataclasses.replace(options, resume=options.run_dir, run_dir=None, resume_or_start=False))
-    return start(config, options)
+        return go_on(config, dataclasses.replace(options, resume=options.run_dir, run_dir=None, resume_or_start=False), heed)
+    return start(config, options, heed)
 
 
 def train(config: Config, options: RunOptions) -> int:

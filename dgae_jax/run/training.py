@@ -2,6 +2,7 @@
 
 import contextlib
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -37,8 +38,21 @@ class RunError(RuntimeError):
         """1 broke down or could write no more; 130, 143, 129 stopped by SIGINT, SIGTERM, SIGHUP."""
 
 
-def run_to_end(config: Config, options: RunOptions, run_dir: Path, state: TrainState | None) -> dict[str, Any]:
-    """Train what is left, evaluate, and write `evaluation.json`, which is returned. Raises RunError."""
+class BrokeDownError(RunError):
+    """A run whose updates or worlds are not finite any more: its settings are to blame, not the machine."""
+
+
+Heed = Callable[[int, dict[str, Any]], None]
+"""Told samples per run and result of every evaluation on the way, when its checkpoint is on its way to the disk. What it raises
+ends the run, which can be resumed."""
+
+
+def unheeded(steps: int, result: dict[str, Any]) -> None:
+    """Let every run go on."""
+
+
+def run_to_end(config: Config, options: RunOptions, run_dir: Path, state: TrainState | None, heed: Heed = unheeded) -> dict[str, Any]:
+    """Train what is left, evaluate, and write `evaluation.json`, which is returned. Raises RunError, and what `heed` raises."""
     terminal.say(_budget(config))
     done = 0 if state is None else int(state.iteration[0])
     with Signals() as signals:
@@ -47,15 +61,15 @@ def run_to_end(config: Config, options: RunOptions, run_dir: Path, state: TrainS
                 if options.resume:
                     directory.write_config(run_dir, config)
                     manifest.add(run_dir, options)
-                state = _iterate(config, options, record, signals, state)
+                state = _iterate(config, options, record, signals, state, heed)
                 if _broken(state, options):
-                    raise RunError(1, _broke_down(state, run_dir))
+                    raise BrokeDownError(1, _broke_down(state, run_dir))
                 result = _evaluate(config, options, record, signals, state)
             files.write_json(run_dir / "evaluation.json", result)
         except Stopped:
             raise RunError(signals.exit_code, f"stopped by {signals.name}; continue with --resume {run_dir}") from None
         except NotFiniteError as reason:
-            raise RunError(1, f"stopped: {reason}, which is not saved; {_left(run_dir)}") from reason
+            raise BrokeDownError(1, f"stopped: {reason}, which is not saved; {_left(run_dir)}") from reason
         except OSError as reason:
             name = reason.filename or "output"
             raise RunError(1, f"stopped: {name}: cannot be written ({reason.strerror}); {_left(run_dir)}") from reason
@@ -67,7 +81,7 @@ def run_to_end(config: Config, options: RunOptions, run_dir: Path, state: TrainS
     return result
 
 
-def _iterate(config: Config, options: RunOptions, record: Record, signals: Signals, state: TrainState | None) -> TrainState:
+def _iterate(config: Config, options: RunOptions, record: Record, signals: Signals, state: TrainState | None, heed: Heed) -> TrainState:
     """All iterations that are left, until the budget is used, a signal came, or it broke down."""
     every = max(1, options.checkpoint_every // config.samples_per_iteration)
     done, count, seconds = record.metrics.iteration, 1, 0.0
@@ -78,7 +92,7 @@ def _iterate(config: Config, options: RunOptions, record: Record, signals: Signa
         resumed = state is not None
         state = _compiled(config, trainer, state, signals, reporter)
         if resumed and done % every == 0:
-            _look(record, state, signals, reporter)  # unless it was evaluated before it stopped
+            _look(record, state, signals, reporter, heed)  # unless it was evaluated before it stopped
         stopping = signals.anywhere()
         while done < config.iterations and not stopping:
             count = min(count, config.iterations - done, every - done % every)
@@ -96,7 +110,7 @@ def _iterate(config: Config, options: RunOptions, record: Record, signals: Signa
             if broken:
                 break
             if due and done < config.iterations:
-                _look(record, state, signals, reporter)
+                _look(record, state, signals, reporter, heed)
                 stopping = signals.anywhere()  # all is saved
     return state
 
@@ -123,11 +137,11 @@ def _dispatch(config: Config, trainer: Trainer, state: TrainState, count: int, r
         raise
 
 
-def _look(record: Record, state: TrainState, signals: Signals, reporter: Reporter) -> None:
+def _look(record: Record, state: TrainState, signals: Signals, reporter: Reporter, heed: Heed) -> None:
     """Evaluate on the way, unless a signal came: a run that goes on later makes up for it."""
     if not record.evaluated:
         with contextlib.suppress(Stopped), signals.may_stop():
-            record.evaluate(hosts.whole(policies_of(state)), reporter.watch)
+            heed(record.steps, record.evaluate(hosts.whole(policies_of(state)), reporter.watch))
 
 
 def _evaluate(config: Config, options: RunOptions, record: Record, signals: Signals, state: TrainState) -> dict[str, Any]:

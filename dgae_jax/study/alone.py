@@ -1,0 +1,41 @@
+"""A trial as an ordinary run in its own directory, which is continued where it was left."""
+
+import dataclasses
+import math
+
+import optuna
+from optuna.trial import Trial
+
+from dgae_jax.configs.config import ConfigError
+from dgae_jax.run import loop
+from dgae_jax.run.training import BrokeDownError
+from dgae_jax.study.storage import first_number
+from dgae_jax.study.tuning import Tuning, quarter, value_of
+
+
+def train(tuning: Tuning, study: optuna.Study, trial: Trial) -> float:
+    """The value of a trial.
+
+    Raises TrialPruned where its settings do not go together, break down or are worse than most, RunError if it was stopped.
+    """
+    try:
+        config = tuning.config_of(trial.params)
+    except ConfigError as reason:
+        raise optuna.TrialPruned(str(reason)) from reason
+    every = quarter(config) * config.samples_per_iteration
+    here = tuning.directory / "trials" / f"{first_number(study, trial):04d}"
+    kept = {"checkpoint_every": every, "keep_checkpoints": 1, "num_processes": 1}
+    options = dataclasses.replace(tuning.options, run_dir=here, resume_or_start=True, inexact=True, **kept)
+
+    def heed(steps: int, result: dict) -> None:
+        trial.report(value_of(result), steps // every)
+        if trial.should_prune():
+            raise optuna.TrialPruned(f"worse than most were after {steps:,} steps")
+
+    try:
+        value = value_of(loop.go_on_or_start(config, options, heed).evaluation)
+    except BrokeDownError as reason:
+        raise optuna.TrialPruned(str(reason)) from reason
+    if not math.isfinite(value):
+        raise optuna.TrialPruned("its return is not finite")
+    return value

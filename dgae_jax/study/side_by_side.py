@@ -1,0 +1,88 @@
+"""Several trials in one compiled program: their settings are traced, so that one program trains them all at once."""
+
+import math
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import optuna
+from optuna.trial import Trial
+
+from dgae_jax.configs.build import make_algorithm, make_task, make_train, make_trainer, policies_of, seed_keys
+from dgae_jax.configs.config import Config
+from dgae_jax.configs.serial import to_dict
+from dgae_jax.envs.base import Env
+from dgae_jax.learn.parallel import COMPILER_OPTIONS, over_seeds
+from dgae_jax.learn.types import TrainState
+from dgae_jax.run import files, machine
+from dgae_jax.run.compiling import compile_aside
+from dgae_jax.run.evaluation import evaluate_policies
+from dgae_jax.run.options import RunOptions
+from dgae_jax.run.signals import Signals, Stopped
+from dgae_jax.study.storage import first_number
+from dgae_jax.study.tuning import Tuning, quarter, value_of
+
+
+def make_step(env: Env) -> Callable[[Config, TrainState], TrainState]:
+    """`step(configs, states) -> states`: an iteration of every trial [B] and seed [S]; the buffers of the states are donated."""
+
+    def one(config: Config, state: TrainState) -> TrainState:
+        return over_seeds(make_train(make_algorithm(str(config.algo), env, config), env, config)[1])(state)[0]
+
+    return jax.jit(jax.vmap(one), donate_argnums=1, compiler_options=COMPILER_OPTIONS)
+
+
+def stacked(trees: list[Any]) -> Any:
+    """One tree with a leading axis of trials."""
+    return jax.tree.map(lambda *leaves: jnp.stack([jnp.asarray(x) for x in leaves]), *trees)
+
+
+def train(tuning: Tuning, study: optuna.Study, trials: list[Trial], signals: Signals) -> list[float | None]:
+    """The value of each trial, None where it was pruned or broke down. Raises Stopped when a signal came: then all is lost."""
+    configs = [tuning.config_of(trial.params) for trial in trials]
+    machine.use_devices(configs[0], RunOptions(devices=1, num_processes=1))
+    machine.use_cache(tuning.options.cache_dir)
+    env, keys, settings = make_task(configs[0]), seed_keys(configs[0]), stacked(configs)
+    init, step = make_trainer(env, 1).init, make_step(env)
+    with signals.may_stop():
+        compile_aside(init, configs[0], keys)
+        states = stacked([init(config, keys) for config in configs])  # one after the other: see parallel.in_turn
+        compile_aside(step, settings, states)
+    evaluate = partial(evaluate_policies, config=configs[0], episodes=tuning.options.episodes)  # no trial's network differs in shape
+    every, results = quarter(configs[0]), [dict[str, Any]() for _ in trials]
+    alive, total = set(range(len(trials))), configs[0].iterations
+    for done in range(1, total + 1):
+        states = jax.block_until_ready(step(settings, states))
+        if signals.received:
+            raise Stopped
+        alive -= _broken(states, tuning.options)
+        if not alive:
+            break
+        if done % every == 0 or done == total:
+            for i in sorted(alive):
+                with signals.may_stop():
+                    results[i] = evaluate(jax.tree.map(lambda x, i=i: x[i], policies_of(states)))
+        if done % every == 0 and done < total:
+            alive -= {i for i in alive if _is_hopeless(trials[i], results[i], done // every)}
+    return [_finish(tuning, study, trials[i], configs[i], results[i]) if i in alive else None for i in range(len(trials))]
+
+
+def _broken(states: TrainState, options: RunOptions) -> set[int]:
+    return {i for i, failures in enumerate(states.failures) if int(failures.max()) >= options.max_nonfinite}
+
+
+def _is_hopeless(trial: Trial, result: dict[str, Any], quarters: int) -> bool:
+    trial.report(value_of(result), quarters)
+    return trial.should_prune()
+
+
+def _finish(tuning: Tuning, study: optuna.Study, trial: Trial, config: Config, result: dict[str, Any]) -> float | None:
+    """Leave settings and evaluation in the trial's directory."""
+    here = tuning.directory / "trials" / f"{first_number(study, trial):04d}"
+    here.mkdir(parents=True, exist_ok=True)
+    files.write_json(here / "evaluation.json", result)
+    files.write_json(here / "config.json", to_dict(config))
+    value = value_of(result)
+    return value if math.isfinite(value) else None
