@@ -35,7 +35,7 @@ def tune(tuning: Tuning) -> int:
     study = open_study(tuning, open_storage(tuning))
     progress = outcome.Progress(study)
     with Signals() as signals:
-        processes = [] if is_over(study, tuning) else _start(tuning)
+        processes = [] if is_over(study, tuning) else start(tuning)
         told = False
         while any(process.is_alive() for process in processes):
             progress.show()
@@ -53,7 +53,7 @@ def tune(tuning: Tuning) -> int:
     return outcome.write(tuning, study)
 
 
-def _start(tuning: Tuning) -> list[BaseProcess]:
+def start(tuning: Tuning) -> list[BaseProcess]:
     """The workers, each on cores of its own."""
     cores = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else []
     context = multiprocessing.get_context("spawn")
