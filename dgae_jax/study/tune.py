@@ -6,6 +6,7 @@ import os
 import signal
 import sys
 import time
+from collections.abc import Sequence
 from multiprocessing.process import BaseProcess
 from pathlib import Path
 
@@ -53,7 +54,7 @@ def tune(tuning: Tuning) -> int:
     return outcome.write(tuning, study)
 
 
-def start(tuning: Tuning) -> list[BaseProcess]:
+def start(tuning: Tuning) -> Sequence[BaseProcess]:
     """The workers, each on cores of its own."""
     cores = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else []
     context = multiprocessing.get_context("spawn")
@@ -83,7 +84,7 @@ def _tell(process: BaseProcess, kind: signal.Signals) -> None:
         os.kill(process.pid, kind)  # pyright: ignore[reportArgumentType]
 
 
-def _explain(tuning: Tuning, processes: list[BaseProcess], stopped: bool) -> None:
+def _explain(tuning: Tuning, processes: Sequence[BaseProcess], stopped: bool) -> None:
     """Say which workers were lost."""
     for number, process in enumerate(processes):
         process.join()

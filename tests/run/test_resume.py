@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from dgae_jax.configs.config import ConfigError
-from dgae_jax.run import directory, files, manifest, metrics
+from dgae_jax.run import directory, files, loop, manifest, metrics
 from dgae_jax.run.loop import resume, resume_or_start, train
 from dgae_jax.run.options import RunOptions
 from tests.runs import QUIET, SMALL, last, small, stopped_half_way, timeless
@@ -139,3 +139,20 @@ def test_resume_or_start_starts_a_run_and_then_goes_on_with_it(finished, tmp_pat
 def test_resume_or_start_needs_a_directory_and_no_other_way_to_resume(options, message):
     with pytest.raises(ConfigError, match=message):
         resume_or_start(small(), dataclasses.replace(QUIET, **options))
+
+
+def test_who_heeds_the_evaluations_may_end_a_run_which_then_goes_on_as_if_it_had_not(finished, tmp_path):
+    run_dir, heard = tmp_path / "run", []
+
+    def heed(steps, result):
+        heard.append((steps, result["episodes"]))
+        raise LookupError("enough")
+
+    with pytest.raises(LookupError, match="enough"):
+        loop.start(small(), dataclasses.replace(QUIET, run_dir=run_dir), heed)
+    assert heard == [(QUIET.checkpoint_every, 1)]
+    assert not (run_dir / "evaluation.json").exists()
+    loop.go_on(small(), dataclasses.replace(QUIET, resume=run_dir), heed)  # what was evaluated before is not heard of again
+    assert len(heard) == 1
+    assert last(run_dir).read_bytes() == last(finished).read_bytes()
+    assert timeless(run_dir) == timeless(finished)

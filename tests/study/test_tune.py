@@ -33,6 +33,7 @@ OPTIONS = RunOptions(cache_dir=QUIET.cache_dir, episodes=1)
 def _features_may_change():
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", optuna.exceptions.ExperimentalWarning)
+        warnings.filterwarnings("ignore", "Heartbeat of storage")  # of asking outside of Optuna's own loop
         yield
 
 
