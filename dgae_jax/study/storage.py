@@ -40,13 +40,14 @@ def unwarned() -> Iterator[None]:
 def open_storage(tuning: Tuning) -> RDBStorage:
     """The database, made if there is none; raises ConfigError if it cannot be reached."""
     optuna.logging.set_verbosity(optuna.logging.ERROR)
-    retry = RetryHeartbeatStaleTrialCallback(RETRIES, inherit_intermediate_values=True)
     file = f"sqlite:///{tuning.directory.absolute() / 'optuna.db'}"
     engine: dict[str, Any] = {"pool_pre_ping": True} if tuning.storage else {"connect_args": {"timeout": WAIT}}
-    beat = {"heartbeat_interval": tuning.heartbeat, "grace_period": 3 * tuning.heartbeat, "heartbeat_stale_trial_callback": retry}
     for attempt in range(5):
         try:
-            return RDBStorage(tuning.storage or file, engine, **beat)
+            with unwarned():
+                retry = RetryHeartbeatStaleTrialCallback(RETRIES, inherit_intermediate_values=True)
+                beat = {"heartbeat_interval": tuning.heartbeat, "grace_period": 3 * tuning.heartbeat}
+                return RDBStorage(tuning.storage or file, engine, **beat, heartbeat_stale_trial_callback=retry)
         except (sqlalchemy.exc.SQLAlchemyError, optuna.exceptions.OptunaError, ImportError) as reason:
             if attempt < 4 and any(words in str(reason) for words in ("already exists", "duplicate key", "UNIQUE constraint")):
                 time.sleep(0.5)  # another process is making the tables
