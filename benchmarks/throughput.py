@@ -34,7 +34,8 @@ import dgae_jax as dg
 from dgae_jax.cli.arguments import parse
 from dgae_jax.configs.build import make_task, make_trainer, seed_keys
 from dgae_jax.configs.config import Config, resolve
-from dgae_jax.learn import devices, iteration
+from dgae_jax.learn import devices
+from dgae_jax.learn.iteration import _acting, _estimate, _roll_out, nothing
 from dgae_jax.learn.parallel import COMPILER_OPTIONS
 from dgae_jax.learn.types import Fitted
 from dgae_jax.physics.cores import cores
@@ -97,8 +98,16 @@ def setting(task: str, algo: str, physics: str, width: int) -> Config:
     return resolve(dataclasses.replace(config, physics=physics, policy=policy, critic=critic))
 
 
-def ours(config: Config, seconds: float) -> Row:
-    """From nothing to the first iteration, then as many iterations as fit, 1 at a time."""
+class Iteration(NamedTuple):
+    """What one iteration takes, and what came before the first."""
+
+    compile_seconds: float
+    seconds: float
+    devices: int
+
+
+def iteration(config: Config, seconds: float) -> Iteration:
+    """From nothing to the first iteration, then as many iterations as fit, one per call."""
     jax.config.update("jax_enable_compilation_cache", False)
     count = machine.use_devices(config, RunOptions())
     began = time.perf_counter()
@@ -111,11 +120,17 @@ def ours(config: Config, seconds: float) -> Row:
         state, _ = jax.block_until_ready(trainer.dispatch(config, state, 1))
         iterations += 1
     one = (time.perf_counter() - since) / iterations
+    return Iteration(compiled - one, one, count)
+
+
+def ours(config: Config, seconds: float) -> Row:
+    """One of our algorithms."""
+    compiled, one, count = iteration(config, seconds)
     samples, alone = config.samples_per_iteration, parts_of(config, count, seconds / 10)
     best = samples / roofline(config)
     return Row(
-        config.env, str(config.algo), str(config.physics), config.policy.hidden[0], config.num_envs, count, compiled - one,
-        samples / one, best, alone,
+        config.env, str(config.algo), str(config.physics), config.policy.hidden[0], config.num_envs, count, compiled, samples / one, best,
+        alone,
     )  # fmt: skip
 
 
@@ -139,10 +154,10 @@ def taken_apart(config: Config, count: int) -> Pieces:
 
     @devices.shared_by(mesh)
     def roll(state, keys):
-        return iteration._roll_out(env, algorithm, state, keys, config.episode_length)
+        return _roll_out(env, algorithm, state, keys, config.episode_length)
 
     def estimate(state, step):
-        return iteration._estimate(algorithm, state, step, step.reward, key, config.gamma, config.lam, iteration.nothing)[0]
+        return _estimate(algorithm, state, step, step.reward, key, config.gamma, config.lam, nothing)[0]
 
     step = jax.device_get(jax.jit(roll)(state, keys)[1])
     batch = jax.jit(estimate)(state, step)
@@ -178,7 +193,7 @@ def _without_physics(config: Config) -> list[tuple[Callable, tuple]]:
     pieces = taken_apart(dataclasses.replace(config, physics="native"), 1)
     state, _ = pieces.rollout[1]
     actor, env = Fitted(state.policy.params, state.observations), make_task(config)
-    act = iteration._acting(dg.make_algorithm(str(config.algo), env, config), actor)
+    act = _acting(dg.make_algorithm(str(config.algo), env, config), actor)
     keys, obs = jax.random.split(jax.random.key(0), config.num_envs), state.episodes.env.obs
     acting = lambda: jax.lax.scan(lambda c, _: (c, act(keys, obs)[0]), 0, None, length=config.horizon)[1]  # noqa: E731
     return [(acting, ()), *pieces[1:]]
