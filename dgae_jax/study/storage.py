@@ -46,7 +46,7 @@ def open_storage(tuning: Tuning) -> RDBStorage:
         try:
             with unwarned():
                 retry = RetryHeartbeatStaleTrialCallback(RETRIES, inherit_intermediate_values=True)
-                beat = {"heartbeat_interval": tuning.heartbeat, "grace_period": 3 * tuning.heartbeat}
+                beat: dict[str, Any] = {"heartbeat_interval": tuning.heartbeat, "grace_period": 3 * tuning.heartbeat}
                 return RDBStorage(tuning.storage or file, engine, **beat, heartbeat_stale_trial_callback=retry)
         except (sqlalchemy.exc.SQLAlchemyError, optuna.exceptions.OptunaError, ImportError) as reason:
             if attempt < 4 and any(words in str(reason) for words in ("already exists", "duplicate key", "UNIQUE constraint")):

@@ -84,7 +84,7 @@ def test_the_best_checkpoint_stays_and_can_be_evaluated(tmp_path):
     honest = record_module.evaluate_policies
 
     def scored(policies, config, **how):
-        score = {"seed": 0, "return_mean": next(scores), "return_std": 0.0}
+        score = {"seed": 0, "return_mean": next(scores), "return_std": 0.0, "returns": []}
         return {**honest(policies, config, **how), "seeds": [score]}
 
     with pytest.MonkeyPatch.context() as patch:
