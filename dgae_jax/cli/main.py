@@ -11,6 +11,8 @@ COMMANDS = {
     "reproduce": "train all of a study: tasks, algorithms and seeds",
     "report": "figures, tables and one page from the results of studies",
     "tune": "search for the settings with the highest return",
+    "render": "make a film of the policy of a run directory",
+    "figures": "draw the robots and the transport of mass",
 }
 """Each is a module of this room with a `main`."""
 

@@ -1,11 +1,12 @@
 """From the checkpoints of a run directory to a training state or to what acting takes of one."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
 import jax
+import numpy as np
 
 from dgae_jax.configs.build import make_task, make_trainer, seed_keys
 from dgae_jax.configs.config import Config, invalid
@@ -62,6 +63,29 @@ def trained(source: Path, config: Config, which: str) -> Trained:
     return _load_networks(run_dir / "checkpoints" / checkpoint.name_of(steps), config)
 
 
+def kept(run_dir: Path, config: Config) -> Iterator[Trained]:
+    """The networks of every checkpoint that a run keeps, oldest first; warns of damaged ones and leaves them out.
+
+    Raises CheckpointError if there is none, or one is of another run than `config`.
+    """
+    paths = checkpoint.found(run_dir / "checkpoints")
+    if not paths:
+        raise _none(run_dir)
+    for path in paths:
+        try:
+            yield _load_networks(path, config)
+        except DamagedError as reason:
+            terminal.warn(f"warning: {reason}; left out")
+
+
+def reward_std(path: Path, config: Config) -> np.ndarray:
+    """What the rewards of every run [S] were last divided by in the checkpoint at `path`; 1 without `normalize_rewards`."""
+    if not config.normalize_rewards:
+        return np.ones(config.num_seeds)
+    part = {"reward_scale": {"returns": {"std": _blank(config).reward_scale.returns.std}}}
+    return np.asarray(checkpoint.load(path, part, part=True)["reward_scale"]["returns"]["std"])
+
+
 def load_state(path: Path, config: Config) -> TrainState:
     """The training state in one file; raises as `checkpoint.load`, and CheckpointError if the file is not of this run."""
     _compare(path, config)
@@ -115,4 +139,8 @@ def _newest(run_dir: Path, read: Callable[[Path], T]) -> tuple[T, Path]:
         for each in wrong:
             terminal.warn(f"warning: {each}; falling back to {path.name}")
         return result, path
-    raise CheckpointError("; ".join(wrong) or f"{run_dir}: must hold a checkpoint; checkpoints/ has none")
+    raise CheckpointError("; ".join(wrong)) if wrong else _none(run_dir)
+
+
+def _none(run_dir: Path) -> CheckpointError:
+    return CheckpointError(f"{run_dir}: must hold a checkpoint; checkpoints/ has none")

@@ -10,6 +10,7 @@ import time
 
 import pytest
 
+from dgae_jax.cli.main import COMMANDS
 from dgae_jax.cli.train import parsed
 from dgae_jax.run import directory, metrics
 from tests.helpers import ROOT, TINY, command
@@ -207,10 +208,10 @@ def test_dgae_runs_a_command_by_name_and_names_them_all(monkeypatch, capsys):
         2,
         "error: --episodes 0: must be a whole number from 1 to 10,000 (they are played side by side)\n",
     )
-    assert dgae("trian") == (2, "", "error: trian: must be one of train, evaluate\n")
+    assert dgae("trian") == (2, "", f"error: trian: must be one of {', '.join(COMMANDS)}\n")
     code, out, err = dgae("--help")
     assert (code, err) == (0, "")
-    assert all(re.search(rf"^  {name} ", out, re.MULTILINE) for name in ("train", "evaluate"))
+    assert all(re.search(rf"^  {name} ", out, re.MULTILINE) for name in ("train", "evaluate", "render", "figures"))
 
 
 def test_a_device_that_is_not_there_is_refused_in_one_line(tmp_path):

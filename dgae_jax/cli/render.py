@@ -1,0 +1,166 @@
+"""Make a film of a trained run: dgae render RUN_DIR --episodes 2
+
+Flags are checked, and the OpenGL to draw with is chosen, before the rest is imported: JAX and MuJoCo take seconds to load.
+"""
+
+import os
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import tyro
+
+from dgae_jax.cli.arguments import fail, parse
+from dgae_jax.configs.config import Config, ConfigError, invalid, resolve
+from dgae_jax.envs.registry import TASKS, spec_of
+from dgae_jax.export import gl, video
+from dgae_jax.run import directory, terminal
+from dgae_jax.run.options import RunOptions
+
+
+@dataclass(frozen=True)
+class Arguments:
+    """What to film, and how."""
+
+    run_dir: tyro.conf.Positional[Path]
+    """Directory of the run [path]."""
+    compare: tuple[Path, ...] = ()
+    """Further runs, shown beside it from the same initial states [paths]."""
+    checkpoint: Literal["newest", "best"] | None = None
+    """newest, or best: of the evaluations while it trained; by default newest."""
+    during: bool = False
+    """The policy at each checkpoint that the run keeps, one after the other, so that one sees it learn."""
+    index: int = 0
+    """Which of the seeds that were trained side by side, from 0."""
+    episodes: int = 1
+    """Episodes, one after the other [episodes]."""
+    seed: int = 0
+    """Seed of the initial states, the same as those of an evaluation [1]."""
+    seconds: float = 10.0
+    """Longest part of an episode that is shown, in the robot's own time [s]."""
+    format: Literal["mp4", "gif", "both"] = "both"
+    """Files to write."""
+    width: int = 480
+    """Width of the picture of each robot, even [pixels]."""
+    height: int = 360
+    """Height of the picture of each robot without the strip below it, even [pixels]."""
+    fps: int = 25
+    """Frames per second of the MP4; a GIF has at most half of the default [1/s]."""
+    out: Path | None = None
+    """File to write, to whose name .mp4 and .gif are added; by default film in the run directory, film-best, film-during or
+    film-compare [path]."""
+    cache_dir: str = RunOptions.cache_dir
+    """Where compiled programs are kept between runs; none disables [path]."""
+
+
+WHOLE = {
+    "index": (0, 99_999, 1),
+    "episodes": (1, 1_000, 1),
+    "seed": (0, 2**31 - 1, 1),
+    "width": (160, 1920, 2),
+    "height": (120, 1080, 2),
+    "fps": (1, 100, 1),
+}
+"""Whole numbers: from, to, and what they are a multiple of."""
+
+LONGEST = 600.0
+"""Seconds of an episode."""
+
+
+def main() -> int:
+    """Film one run or several; 0 done, 2 bad input or no OpenGL, 130 stopped by SIGINT."""
+    terminal.prepare()
+    try:
+        arguments = parse(Arguments, "Make a film of the deterministic policy of a trained run, in Gymnasium.")
+        _check(arguments)
+        configs = [_config(path, arguments.index) for path in (arguments.run_dir, *arguments.compare)]
+        _check_out(arguments)
+        gl.choose()
+        return _render(arguments, configs)
+    except ConfigError as mistake:
+        fail(mistake)
+    except KeyboardInterrupt:
+        terminal.warn("stopped by SIGINT, nothing written")
+        return 130
+
+
+def _check(arguments: Arguments) -> None:
+    """Raise ConfigError for the first argument that is invalid."""
+    for name, (low, high, multiple) in WHOLE.items():
+        value = getattr(arguments, name)
+        if not low <= value <= high or value % multiple:
+            kind = "an even" if multiple == 2 else "a whole"
+            raise invalid(name, value, f"{kind} number from {low:,} to {high:,}")
+    if not 0 < arguments.seconds <= LONGEST:
+        raise invalid("seconds", arguments.seconds, f"a number above 0, up to {LONGEST:g}")
+    for other in ("compare", "checkpoint"):
+        if arguments.during and getattr(arguments, other):
+            raise invalid(other, getattr(arguments, other), "left out with --during, which shows every checkpoint of one run")
+    if "mp4" in video.FORMATS[arguments.format]:
+        video.check_extra()
+
+
+def _check_out(arguments: Arguments) -> None:
+    stem = _stem(arguments)
+    if not os.access(stem.absolute().parent, os.W_OK):
+        raise invalid("out", stem, "a file in a directory that can be written")
+    for kind in video.FORMATS[arguments.format]:
+        path = stem.with_name(f"{stem.name}.{kind}")
+        if path.is_symlink() or (path.exists() and not path.is_file()):
+            raise invalid("out", path, "a file, not a directory, a link or a device")
+
+
+def _config(path: Path, index: int) -> Config:
+    """The configuration of a run that Gymnasium can play."""
+    config = resolve(directory.read_config(path))
+    if not spec_of(config.env).referees:
+        raise ConfigError(f"{path}: must be a run of {', '.join(TASKS)}, which Gymnasium plays; it is one of {config.env}")
+    if index >= config.num_seeds:
+        raise invalid("index", index, f"below {config.num_seeds}, the number of seeds in {path}")
+    return config
+
+
+def _stem(arguments: Arguments) -> Path:
+    """The file to write, without its ending."""
+    if arguments.out is None:
+        kinds = {"during": arguments.during, "compare": arguments.compare, "best": arguments.checkpoint == "best"}
+        return arguments.run_dir / "-".join(["film", *(kind for kind, is_so in kinds.items() if is_so)])
+    out = arguments.out
+    return out.with_suffix("") if out.suffix in (".mp4", ".gif") else out
+
+
+def _titles(paths: list[Path]) -> list[str]:
+    """The names of the runs; their whole paths where two names are the same."""
+    names = [path.resolve().name for path in paths]
+    return names if len(set(names)) == len(names) else [str(path) for path in paths]
+
+
+def _render(arguments: Arguments, configs: list[Config]) -> int:
+    from dgae_jax.export import episodes, film
+    from dgae_jax.run import machine
+    from dgae_jax.run.progress import Reporter
+
+    machine.use_devices(configs[0], RunOptions(devices=1, num_processes=1))
+    machine.use_cache(arguments.cache_dir)
+    shots = episodes.Shots(arguments.episodes, arguments.seed, arguments.seconds)
+    paths = [arguments.run_dir, *arguments.compare]
+    if arguments.during:
+        scenes = episodes.of_checkpoints(arguments.run_dir, configs[0], arguments.index, shots)
+    else:
+        runs = list(zip(_titles(paths), paths, configs, strict=True))
+        scenes = episodes.of_runs(runs, arguments.checkpoint or "newest", arguments.index, shots)
+    stem, size = _stem(arguments), film.Size(arguments.width, arguments.height)
+    with Reporter() as reporter:
+        frames = film.film(scenes, size, arguments.fps, reporter.watch)
+        try:
+            written = video.write(frames, stem, video.FORMATS[arguments.format], arguments.fps)
+        except OSError as reason:
+            raise invalid("out", stem, f"a file that can be written ({reason.strerror})") from reason
+    for path in written:
+        terminal.say(f"written to {path} ({path.stat().st_size / 1e6:.1f} MB)")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

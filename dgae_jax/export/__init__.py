@@ -1,0 +1,1 @@
+"""A trained policy leaves the house: pictures and films of it."""
