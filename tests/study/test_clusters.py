@@ -56,4 +56,4 @@ def test_submitit_runs_the_cells_as_jobs(whole, tmp_path):
     done = subprocess.run(words, cwd=ROOT, capture_output=True, text=True, timeout=500, check=False)
     assert (done.returncode, done.stderr) == (0, ""), done.stdout
     assert studies.rows(tmp_path / "study") == whole
-    assert len(list(tmp_path.glob("study/slurm/*"))) == 3
+    assert len(list(tmp_path.glob("study/slurm/*/*result.pkl"))) == 3
