@@ -84,14 +84,17 @@ def _cells(arguments: Arguments, rest: list[str]) -> tuple[list[matrix.Cell], Ru
         nonlocal options
         start = ["--config", str(arguments.config)] if arguments.config else ["--preset", arguments.preset]
         config, options = train.parsed([*start, "--env", task, "--algo", algo, *rest])
-        _refuse(config, options)
+        _refuse(config, options, task, algo)
         return config if arguments.scale == 1 else dataclasses.replace(config, total_steps=int(arguments.scale * config.total_steps))
 
     return matrix.matrix(arguments.envs, arguments.algos, arguments.seeds, arguments.seeds_per_run, make), options
 
 
-def _refuse(config: Config, options: RunOptions) -> None:
+def _refuse(config: Config, options: RunOptions, task: str, algo: str) -> None:
     """What belongs to one run alone."""
+    for name, ours in (("env", task), ("algo", algo)):
+        if getattr(config, name) != ours:
+            raise invalid(name, getattr(config, name), f"left out: --{name}s says which")
     if config.seed or config.num_seeds != 1:
         name = "seed" if config.seed else "num_seeds"
         raise invalid(name, getattr(config, name), "left out: --seeds and --seeds-per-run say which")

@@ -87,7 +87,7 @@ def opened(path: Path, cells: Sequence[Cell], command: str) -> Iterator[Study]:
     """
     try:
         if path.exists() and not (path / "study.json").exists() and any(each.name != ".lock" for each in path.iterdir()):
-            raise invalid("study", path, "a study, or a new or empty directory")
+            raise ConfigError(f"study {path}: must be a study, or a new or empty directory")
         path.mkdir(parents=True, exist_ok=True)
         with (path / ".lock").open("w") as lock:
             _hold(lock, path)
@@ -100,14 +100,14 @@ def opened(path: Path, cells: Sequence[Cell], command: str) -> Iterator[Study]:
                 files.write_json(path / "study.json", {"schema": SCHEMA, "cells": each, "commands": study.commands})
             yield study
     except OSError as reason:
-        raise ConfigError(f"study {path}: must be a directory that can be written ({reason.strerror})", "study") from reason
+        raise ConfigError(f"study {path}: must be a directory that can be written ({reason.strerror})") from reason
 
 
 def _hold(lock: TextIO, path: Path) -> None:
     try:
         fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError:
-        raise ConfigError(f"study {path}: must not be in use; another process runs it", "study") from None
+        raise ConfigError(f"study {path}: must not be in use; another process runs it") from None
     except OSError as reason:  # some network file systems have no locks
         terminal.warn(f"warning: {path} cannot be locked ({reason.strerror}): run one study in it at a time")
 
@@ -133,6 +133,6 @@ def read(path: Path) -> Study:
                 raise ValueError(f"cell {name[:100]!r} is named otherwise")
         return Study(path, cells, dict(data["commands"]))
     except OSError as reason:
-        raise ConfigError(f"study {path}: must be the directory of a study ({reason.strerror})", "study") from reason
+        raise ConfigError(f"study {path}: must be the directory of a study ({reason.strerror})") from reason
     except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as reason:
         raise ConfigError(f"{path / 'study.json'}: must be a study that can be read ({reason})") from reason

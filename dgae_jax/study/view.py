@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-from rich.console import Console
+from rich.console import Console, Group
 from rich.live import Live
 from rich.table import Table
 
@@ -98,8 +98,8 @@ class View:
         left = f"about {_clock((total - there) * seconds / made)} left" if made else "time left not known yet"
         return f"{there:,} of {total:,} steps, {left}"
 
-    def _table(self, far: dict[str, Reached]) -> Table:
-        table = Table(title=self._line(far), title_justify="left", title_style="", box=None, pad_edge=False)
+    def _table(self, far: dict[str, Reached]) -> Group:
+        table = Table(box=None, pad_edge=False)
         for name in ("task", "algorithm", "done", "running", "failed", "steps", "return"):
             table.add_column(name, justify="left" if name in ("task", "algorithm") else "right")
         groups: dict[tuple[str, str], list[Cell]] = {}
@@ -107,7 +107,7 @@ class View:
             groups.setdefault((cell.config.env, str(cell.config.algo)), []).append(cell)
         for (task, algo), cells in groups.items():
             table.add_row(task, algo, *self._numbers(cells, far))
-        return table
+        return Group(self._line(far), table)
 
     def _numbers(self, cells: Sequence[Cell], far: dict[str, Reached]) -> list[str]:
         states = [self.state[cell.name] for cell in cells]

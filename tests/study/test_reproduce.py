@@ -1,6 +1,8 @@
 """A study as a user meets it: real processes, real runs."""
 
+import errno
 import json
+import os
 import shutil
 import signal
 import sys
@@ -11,7 +13,7 @@ import pytest
 
 import dgae_jax as dg
 from dgae_jax.cli.reproduce import main
-from dgae_jax.run import metrics, restore
+from dgae_jax.run import files, metrics, restore
 from dgae_jax.run.evaluation import evaluate_run
 from tests import studies
 from tests.runs import last
@@ -95,6 +97,21 @@ def test_killed_in_the_middle_the_same_command_ends_with_the_same_results(whole,
     assert studies.rows(study) == studies.rows(whole[0])
 
 
+def test_a_full_disk_is_one_line_and_loses_nothing(monkeypatch, capsys, study):
+    def full(*_):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    before = (study / "results.jsonl").read_bytes()
+    monkeypatch.setattr(files, "replace", full)
+    monkeypatch.setattr(sys, "argv", ["reproduce", str(study), *studies.SHAPE])
+    with pytest.raises(SystemExit) as stop:
+        main()
+    out, err = capsys.readouterr()
+    assert (stop.value.code, out) == (2, "")
+    assert err == f"error: study {study}: must be a directory that can be written (No space left on device)\n"
+    assert (study / "results.jsonl").read_bytes() == before
+
+
 @pytest.mark.slow
 def test_a_signal_stops_all_cells_with_a_checkpoint_and_the_same_command_goes_on(whole, tmp_path):
     study, long = tmp_path / "stopped", ["--total-steps", "100_000_000"]
@@ -122,6 +139,8 @@ def test_a_signal_stops_all_cells_with_a_checkpoint_and_the_same_command_goes_on
         (["--seeds", "0", "0"], "error: --seeds 0 0: must be at least one, each once"),
         (["--preset", "best"], "error: --preset best: must be one of tuned, paper"),
         (["--gama", "0.9"], "error: "),
+        (["--env", "ant", "--envs", "hopper"], "error: --env ant: must be left out: --envs says which"),
+        (["--algo", "ppo"], "error: --algo ppo: must be left out: --algos says which"),
         (["--seed", "3"], "error: --seed 3: must be left out: --seeds and --seeds-per-run say which"),
         (["--run-dir", "x"], "error: --run-dir x: must be left out: it is of one run alone"),
         (["--config", "nowhere.json"], "error: --config nowhere.json: must be used with one of --algos"),
