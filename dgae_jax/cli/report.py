@@ -25,6 +25,8 @@ class Arguments:
     """Directory to write to; by default report in the directory of the first study [path]."""
     published: bool = False
     """Mark the results of docs/published.csv in the learning curves."""
+    videos: bool = False
+    """Film a typical run of each task for the page: of the best algorithm, the seed in the middle; they stay in STUDY/videos."""
     markdown: Path | None = None
     """A Markdown file in which the tables between `<!-- dgae report: NAME -->` and `<!-- /dgae report -->` are replaced; NAME is
     returns, reach or speed [path]."""
@@ -54,10 +56,14 @@ def _report(arguments: Arguments) -> int:
     out = arguments.out or studies[0].directory / "report"
     _check_out(out)
     known = published.read() if arguments.published else []
+    from dgae_jax.cli import films
     from dgae_jax.report import groups, markdown, write
 
     if arguments.markdown:
         markdown.blocks(arguments.markdown)
+    if arguments.videos:
+        for path in (path for study in studies for path in films.make(study)):
+            terminal.say(f"written {path}")
     for path in write.write(studies, out, known):
         terminal.say(f"written {path}")
     if arguments.markdown:

@@ -5,6 +5,8 @@ import sys
 
 import pytest
 
+from dgae_jax.cli.films import typical
+from dgae_jax.report import results
 from tests.helpers import ROOT, command
 from tests.report.rows import plain, row, study, whole
 
@@ -52,6 +54,19 @@ def test_tables_in_a_document_are_replaced(run, tmp_path):
     code, out, _ = run(path, "--markdown", document)
     assert (code, out.splitlines()[-1]) == (0, f"written {document}: returns")
     assert "| hopper-v4 | DPPO | 2 | 2 ± 1 | 2 [1, 3] |" in document.read_text()
+
+
+def test_the_run_to_film_is_the_middle_seed_of_the_best_algorithm(tmp_path):
+    rows = plain([1, 9, 5], algo="ppo") + plain([4, 8, 9], algo="dppo")
+    chosen = typical(list(results.read(study(tmp_path / "one", rows)).rows))
+    assert (chosen.algo, chosen.final) == ("dppo", 8)
+
+
+def test_films_of_runs_that_are_elsewhere_are_refused_before_anything_is_written(run, tmp_path):
+    path = study(tmp_path / "one", plain([1, 3]))
+    code, _, err = run(path, "--videos")
+    assert (code, err) == (2, f"error: --videos True: must be left out: the runs of {path} are not here\n")
+    assert not (path / "report").exists()
 
 
 @pytest.fixture
