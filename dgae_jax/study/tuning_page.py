@@ -75,6 +75,7 @@ def _png(draw: Callable[[], Any]) -> bytes:
 def _history(tuning: Tuning, study: optuna.Study) -> Any:
     axes = optuna.visualization.matplotlib.plot_optimization_history(study, target_name=TARGET)
     axes.set(title="Return of each trial", xlabel="trial")
+    axes.xaxis.get_major_locator().set_params(integer=True)
     return axes
 
 
@@ -85,7 +86,9 @@ def _history_words(tuning: Tuning, study: optuna.Study, best: list[FrozenTrial])
 
 def _importances(tuning: Tuning, study: optuna.Study) -> Any:
     axes = optuna.visualization.matplotlib.plot_param_importances(study, target_name=TARGET)
-    axes.set(title="How much of the spread each setting explains")
+    axes.set_title("", loc="left")  # where Optuna has its own
+    axes.set(title="How much of the spread each setting explains", xlabel="share", ylabel="")
+    axes.legend_.remove()
     return axes
 
 

@@ -56,6 +56,10 @@ def start(study, *more):
     return subprocess.Popen(words, cwd=ROOT, text=True, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
 
 
+def table_of(study):
+    return list(csv.DictReader((study / "trials.csv").read_text().splitlines()))
+
+
 def wait_for(what, seconds=120):
     deadline = time.monotonic() + seconds
     while not what():
@@ -80,7 +84,7 @@ def tuned(tmp_path_factory):
 
 def test_a_tuning_finishes_as_many_trials_as_were_asked_for_and_leaves_them_in_a_table(tuned):
     study, lines = tuned
-    rows = list(csv.DictReader((study / "trials.csv").open()))
+    rows = table_of(study)
     assert [row["trial"] for row in rows] == list("01234")
     assert {row["state"] for row in rows} <= {"complete", "pruned"}
     assert sum(line.startswith("trial ") and "; best " in line for line in lines) == 5
@@ -89,7 +93,7 @@ def test_a_tuning_finishes_as_many_trials_as_were_asked_for_and_leaves_them_in_a
 
 
 def test_the_first_trial_is_the_preset_itself(tuned):
-    rows = list(csv.DictReader((tuned[0] / "trials.csv").open()))
+    rows = table_of(tuned[0])
     assert (float(rows[0]["gamma"]), float(rows[0]["lam"])) == (0.99, 0.95)
 
 
@@ -102,7 +106,7 @@ def test_each_trial_is_an_ordinary_run_of_seeds_that_reports_do_not_use(tuned):
 
 def test_the_best_file_is_a_configuration_to_train_from_with_the_settings_of_the_best_trial(tuned):
     study, lines = tuned
-    rows = [row for row in csv.DictReader((study / "trials.csv").open()) if row["state"] == "complete"]
+    rows = [row for row in table_of(study) if row["state"] == "complete"]
     best = max(rows, key=lambda row: float(row["return_mean"]))
     result = json.loads((study / "trials" / f"{int(best['trial']):04d}" / "evaluation.json").read_text())
     assert float(best["return_mean"]) == result["return_mean"]
@@ -135,12 +139,12 @@ def test_the_page_is_one_file_whose_pictures_have_words(tuned):
 
 def test_a_tuning_that_is_over_is_reported_again_and_more_trials_go_on_from_it(tuned):
     study, _ = tuned
-    before = list(csv.DictReader((study / "trials.csv").open()))
+    before = table_of(study)
     process = start(study, "--trials", "6", "--workers", "1")
     out, errors = process.communicate(timeout=300)
     assert (process.returncode, errors) == (0, "")
     assert out.splitlines()[0] == "going on after 5 finished trials"
-    after = list(csv.DictReader((study / "trials.csv").open()))
+    after = table_of(study)
     assert (after[:5], len(after)) == (before, 6)
 
 
@@ -183,7 +187,7 @@ def test_a_signal_stops_it_with_its_exit_code_and_the_same_command_goes_on_where
     out, errors = process.communicate(timeout=240)
     assert (process.returncode, errors) == (0, ""), out
     assert "resuming from steps_" in (study / "worker-0.log").read_text()
-    assert len(list(csv.DictReader((study / "trials.csv").open()))) == 2
+    assert len(table_of(study)) == 2
     assert [path.name for path in sorted((study / "trials").iterdir())] == ["0000", "0002"]
 
 
@@ -193,7 +197,7 @@ def test_machines_without_a_common_disk_share_a_study_in_postgresql(postgres, tm
     for process in processes:
         out, errors = process.communicate(timeout=300)
         assert (process.returncode, errors) == (0, ""), out
-    tables = [list(csv.DictReader((place / "trials.csv").open())) for place in places]
+    tables = [table_of(place) for place in places]
     assert tables[0] == tables[1]
     assert len(tables[0]) == 4
     assert (places[0] / "best.json").read_bytes() == (places[1] / "best.json").read_bytes()
