@@ -175,7 +175,7 @@ def test_a_killed_process_loses_no_finished_trial_and_the_others_finish_its_own(
 
 def test_a_signal_stops_it_with_its_exit_code_and_the_same_command_goes_on_where_it_was(tmp_path):
     study = tmp_path / "study"
-    more = ["--trials", "2", "--workers", "1", "--total-steps", str(64 * 2000)]
+    more = ["--trials", "2", "--workers", "1", "--total-steps", str(64 * 600)]
     process = start(study, *more)
     wait_for(lambda: list((study / "trials").glob("0000/checkpoints/*.msgpack")))
     process.send_signal(signal.SIGINT)
