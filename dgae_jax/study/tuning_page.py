@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 
 import matplotlib
 import optuna
+from matplotlib.ticker import MaxNLocator
 from optuna.trial import FrozenTrial
 
 from dgae_jax.run import files
@@ -75,7 +76,7 @@ def _png(draw: Callable[[], Any]) -> bytes:
 def _history(tuning: Tuning, study: optuna.Study) -> Any:
     axes = optuna.visualization.matplotlib.plot_optimization_history(study, target_name=TARGET)
     axes.set(title="Return of each trial", xlabel="trial")
-    axes.xaxis.get_major_locator().set_params(integer=True)
+    axes.xaxis.set_major_locator(MaxNLocator(integer=True))
     return axes
 
 
@@ -85,10 +86,10 @@ def _history_words(tuning: Tuning, study: optuna.Study, best: list[FrozenTrial])
 
 
 def _importances(tuning: Tuning, study: optuna.Study) -> Any:
-    axes = optuna.visualization.matplotlib.plot_param_importances(study, target_name=TARGET)
+    axes: Any = optuna.visualization.matplotlib.plot_param_importances(study, target_name=TARGET)
     axes.set_title("", loc="left")  # where Optuna has its own
     axes.set(title="How much of the spread each setting explains", xlabel="share", ylabel="")
-    axes.legend_.remove()
+    axes.get_legend().remove()  # its only entry is the share
     return axes
 
 
