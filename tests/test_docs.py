@@ -8,7 +8,11 @@ import pytest
 from benchmarks.table import table
 from dgae_jax.configs.algorithms import TABLE
 from dgae_jax.configs.parts import UPDATES
+from dgae_jax.configs.serial import to_dict
 from dgae_jax.maths.risk import METRICS
+from dgae_jax.report import markdown, results
+from dgae_jax.report.groups import groups_of
+from dgae_jax.run import restore
 from tests.helpers import ROOT
 
 DOCUMENTS = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
@@ -48,3 +52,16 @@ def test_modules_that_documents_name_exist(path):
 def test_a_table_of_measurements_is_what_its_command_prints(path):
     for file, block in re.findall(r"<!-- python benchmarks/table\.py (\S+) -->\n(.*?)\n<!-- -->", path.read_text(), re.DOTALL):
         assert block == table(json.loads((ROOT / file).read_text()))
+
+
+def test_the_tables_of_results_are_what_the_report_says(tmp_path):
+    readme = tmp_path / "README.md"
+    readme.write_bytes((ROOT / "README.md").read_bytes())
+    assert markdown.replace(readme, groups_of(results.read(ROOT / "results" / "tuned").rows)) == ["returns"]
+    assert readme.read_bytes() == (ROOT / "README.md").read_bytes()
+
+
+def test_a_committed_policy_is_there_for_every_result_and_knows_its_configuration():
+    for row in results.read(ROOT / "results" / "tuned").rows:
+        config = to_dict(restore.config_of(ROOT / "results" / "tuned" / "policies" / f"{row.cell}.msgpack"))
+        assert json.loads(json.dumps(config)) == row.config

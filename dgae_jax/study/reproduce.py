@@ -26,7 +26,7 @@ def reproduce(study: Study, cells: Sequence[Cell], options: RunOptions, launch: 
     0 all are done; 1 some failed; 128 + the signal if one came: the same call goes on. Raises ConfigError if the launcher cannot start.
     """
     begin = launcher(launch)
-    rows = {cell.name: results.rows_of(study, cell) for cell in study.cells if results.is_done(study, cell)}
+    rows = results.of_study(study)
     results.write(study, rows)
     jobs = [Job(study, cell, options) for cell in cells if cell.name not in rows]
     terminal.say(f"{study.path}: {len(cells) - len(jobs)} of {len(cells)} cells are done" + (f", {len(jobs)} to train" if jobs else ""))

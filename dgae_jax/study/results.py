@@ -23,6 +23,20 @@ def is_done(study: Study, cell: Cell) -> bool:
     return (study.run_dir(cell) / "evaluation.json").is_file()
 
 
+def of_study(study: Study) -> dict[str, list[dict[str, Any]]]:
+    """The rows of all cells that are done, by their names; of cells whose run directory is elsewhere those that were written before."""
+    path, before = study.path / "results.jsonl", {}
+    for row in metrics.read(path) if path.is_file() else []:
+        before.setdefault(row.get("cell"), []).append(row)
+    found = {}
+    for cell in study.cells:
+        if is_done(study, cell):
+            found[cell.name] = rows_of(study, cell)
+        elif cell.name in before and not study.run_dir(cell).exists():
+            found[cell.name] = before[cell.name]
+    return found
+
+
 def rows_of(study: Study, cell: Cell) -> list[dict[str, Any]]:
     """A row per seed of a cell that is done; its policy is written too, unless it is there."""
     run_dir, config = study.run_dir(cell), cell.config

@@ -71,6 +71,14 @@ def test_run_again_it_skips_what_is_done_and_writes_the_same(study):
     assert (study / "results.jsonl").read_bytes() == before
 
 
+def test_results_without_their_run_directories_are_kept_and_their_cells_are_done(study):
+    before = (study / "results.jsonl").read_bytes()
+    shutil.rmtree(study / "runs")
+    code, lines, errors = studies.finish(studies.start(study))
+    assert (code, lines, errors) == (0, [f"{study}: 4 of 4 cells are done"], "")
+    assert (study / "results.jsonl").read_bytes() == before
+
+
 def test_a_broken_cell_goes_on_from_its_checkpoint_and_a_failed_one_stops_no_other(whole, study):
     torn, lost = study / "runs/hopper-ppo-0", study / "runs/hopper-dppo-1"
     last(torn).unlink()
