@@ -12,8 +12,9 @@ from typing import Literal
 import tyro
 
 from dgae_jax.cli.arguments import fail, parse
-from dgae_jax.configs.config import Config, ConfigError, invalid
-from dgae_jax.run import directory, files, terminal
+from dgae_jax.cli.source import config_of
+from dgae_jax.configs.config import ConfigError, invalid
+from dgae_jax.run import files, terminal
 from dgae_jax.run.options import WHOLE, RunOptions
 
 
@@ -67,7 +68,7 @@ def _check(arguments: Arguments) -> None:
 
 
 def _evaluate(arguments: Arguments) -> int:
-    config = _config_of(arguments.run_dir)
+    config = config_of(arguments.run_dir)
     from dgae_jax.run import evaluation, machine
     from dgae_jax.run.progress import Reporter
     from dgae_jax.run.summary import describe
@@ -87,15 +88,6 @@ def _evaluate(arguments: Arguments) -> int:
         raise invalid("out", out, f"a file that can be written ({reason.strerror})") from reason
     terminal.say(f"{describe(result)}, {result['checkpoint']}; written to {out}")
     return 0
-
-
-def _config_of(source: Path) -> Config:
-    """Without JAX where it can be had without."""
-    if not source.is_file():
-        return directory.read_config(source)
-    from dgae_jax.run import restore
-
-    return restore.config_of(source)
 
 
 if __name__ == "__main__":

@@ -12,6 +12,7 @@ COMMANDS = {
     "report": "figures, tables and one page from the results of studies",
     "tune": "search for the settings with the highest return",
     "render": "make a film of the policy of a run directory",
+    "export": "take the policy of a run directory out, as NumPy, ONNX or an agent of Gymnasium",
     "figures": "draw the robots and the transport of mass",
 }
 """Each is a module of this room with a `main`."""

@@ -1,1 +1,1 @@
-"""A trained policy leaves the house: pictures and films of it."""
+"""A trained policy leaves the house: files for programs without JAX, pictures and films of it."""

@@ -30,12 +30,12 @@ def add(run_dir: Path, options: RunOptions) -> None:
 
 def options(run_dir: Path) -> RunOptions:
     """The options of the last part of the run, as far as they can be read."""
-    return from_dict(_last(run_dir).get("options"))
+    return from_dict(last(run_dir).get("options"))
 
 
 def changes(run_dir: Path, options: RunOptions) -> list[str]:
     """What decides the bits of a result and is not what it was in the last part of the run."""
-    was, now = _deciding(_last(run_dir)), _deciding(_now(options))
+    was, now = _deciding(last(run_dir)), _deciding(_now(options))
     return [f"{name} {value} (was {was.get(name)})" for name, value in now.items() if was.get(name) != value]
 
 
@@ -47,7 +47,8 @@ def _deciding(part: dict[str, Any]) -> dict[str, Any]:
     return found | {"devices": options.get("devices") if isinstance(options, dict) else None}
 
 
-def _last(run_dir: Path) -> dict[str, Any]:
+def last(run_dir: Path) -> dict[str, Any]:
+    """By what the last part of the run was computed; empty if it cannot be read."""
     before = _read(run_dir)
     part = (_resumed(before) or [before])[-1]
     return part if isinstance(part, dict) else {}

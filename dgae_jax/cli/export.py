@@ -1,0 +1,102 @@
+"""Take a trained policy out of a run: dgae export RUN_DIR --to npz onnx gymnasium
+
+Flags are checked before the rest is imported: JAX, MuJoCo and Brax take seconds to load.
+"""
+
+import os
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import tyro
+
+from dgae_jax.cli.arguments import fail, parse
+from dgae_jax.cli.source import config_of
+from dgae_jax.configs.config import Config, ConfigError, invalid, resolve
+from dgae_jax.envs.registry import spec_of
+from dgae_jax.export import graph
+from dgae_jax.run import terminal
+from dgae_jax.run.options import RunOptions
+
+
+@dataclass(frozen=True)
+class Arguments:
+    """Which policy, and how it is to be used."""
+
+    run_dir: tyro.conf.Positional[Path]
+    """Directory of the run, or the file of a policy [path]."""
+    to: tuple[Literal["npz", "onnx", "gymnasium"], ...]
+    """One or more of npz (arrays and a program of NumPy alone), onnx (a model for ONNX Runtime and others) and gymnasium (a program
+    that plays the task without JAX); each becomes a directory of its own."""
+    checkpoint: Literal["newest", "best"] = "newest"
+    """newest, or best: of the evaluations while it trained."""
+    index: int = 0
+    """Which of the seeds that were trained side by side, from 0."""
+    out: Path | None = None
+    """Directory to write npz/, onnx/ and gymnasium/ in; by default export in the run directory, or beside the policy's file, with its
+    name in front [path]."""
+
+
+def main() -> int:
+    """Export one policy; 0 done, 2 bad input, 130 stopped by SIGINT."""
+    terminal.prepare()
+    try:
+        arguments = parse(Arguments, "Take a trained policy and its critic out of a run, for programs without JAX.")
+        config, out = _checked(arguments)
+        return _export(arguments, config, out)
+    except ConfigError as mistake:
+        fail(mistake)
+    except KeyboardInterrupt:
+        terminal.warn("stopped by SIGINT")
+        return 130
+
+
+def _checked(arguments: Arguments) -> tuple[Config, Path]:
+    """The run's configuration and the directory to write in; raises ConfigError for the first argument that is invalid."""
+    if not arguments.to:
+        raise invalid("to", "nothing", "one or more of npz, onnx, gymnasium")
+    if "onnx" in arguments.to:
+        graph.check_extra()
+    config = resolve(config_of(arguments.run_dir))
+    if not 0 <= arguments.index < config.num_seeds:
+        allowed = f"a whole number from 0 to {config.num_seeds - 1}, the index of a seed in {arguments.run_dir}"
+        raise invalid("index", arguments.index, allowed)
+    if "gymnasium" in arguments.to and not spec_of(config.env).referees:
+        raise invalid("to", "gymnasium", f"left out with {config.env}, which Gymnasium does not play")
+    out = arguments.out or _default_out(arguments.run_dir)
+    if not _can_be_written(out):
+        raise invalid("out", out, "a directory that can be written")
+    return config, out
+
+
+def _can_be_written(out: Path) -> bool:
+    """As far as can be seen from what exists of the path."""
+    try:
+        above = next(path for path in (out.absolute(), *out.absolute().parents) if path.exists())
+    except OSError:  # the name is too long, or lies behind a directory that may not be read
+        return False
+    return above.is_dir() and os.access(above, os.W_OK)
+
+
+def _default_out(source: Path) -> Path:
+    return source.with_name(f"{source.stem}-export") if source.is_file() else source / "export"
+
+
+def _export(arguments: Arguments, config: Config, out: Path) -> int:
+    from dgae_jax.export import bundle
+    from dgae_jax.run import machine
+
+    machine.use_devices(config, RunOptions(devices=1, num_processes=1))
+    formats = list(dict.fromkeys(arguments.to))
+    try:
+        written = bundle.export(arguments.run_dir, config, arguments.checkpoint, arguments.index, formats, out)
+    except OSError as reason:
+        raise invalid("out", out, f"a directory that can be written ({reason.strerror})") from reason
+    for kind, names in written.items():
+        terminal.say(f"written to {out / kind}: {', '.join(names)}")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

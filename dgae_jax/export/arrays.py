@@ -1,0 +1,87 @@
+"""A trained policy and its critic as plain arrays by name, all that is needed to act: what every exported file is made of.
+
+`policy_weight_I` [inputs, outputs] and `policy_bias_I` are the layers from the first to the last, likewise the critic's; tanh stands
+between layers. Observations are normalised before: (obs - `observation_mean`) / `observation_std`, clipped to ± `observation_limit`.
+Actions are clipped to `action_low` … `action_high`. `env` is Gymnasium's name of the task, `episode_length` its time limit.
+"""
+
+import io
+from typing import Any
+
+import jax
+import numpy as np
+
+from dgae_jax.configs.build import make_task
+from dgae_jax.configs.config import Config, ConfigError
+from dgae_jax.export.outside import policy as outside
+from dgae_jax.learn.normalizers import OBSERVATION_LIMIT
+from dgae_jax.run.api import Policy
+from dgae_jax.run.evaluation import referee
+from dgae_jax.run.restore import Trained
+
+Arrays = dict[str, np.ndarray]
+
+TOLERANCE = 1e-4
+"""Largest difference between the arrays' outputs and those of the policy itself, absolute and relative."""
+
+
+def arrays_of(found: Trained, config: Config, index: int) -> Arrays:
+    """The arrays of one of the seeds trained side by side.
+
+    Raises ConfigError if they do not do what the policy does, because a part of its networks is of another make.
+    """
+    policy, critic = jax.tree.map(lambda x: x[index], (found.policy, found.critic))
+    env = make_task(config)
+    low, high = env.action_range
+    try:
+        layers = {**_layers("policy", policy.params), **_layers("critic", critic.params)}
+    except KeyError as name:
+        raise _foreign(found, f"{name} is missing") from name
+    arrays = {
+        **_normaliser(policy.observations, int(env.observation_size)),  # pyright: ignore[reportArgumentType]
+        **layers,
+        "action_low": np.asarray(low, np.float32),
+        "action_high": np.asarray(high, np.float32),
+        "env": np.array(referee(config)),
+        "episode_length": np.array(config.episode_length),
+    }
+    _compare(arrays, Policy(policy, critic, config), found)
+    return arrays
+
+
+def packed(arrays: Arrays) -> bytes:
+    """The arrays as the bytes of a file `.npz`."""
+    file = io.BytesIO()
+    np.savez(file, **arrays)  # pyright: ignore[reportArgumentType]
+    return file.getvalue()
+
+
+def _normaliser(statistics: Any, size: int) -> Arrays:
+    """Without statistics, one that changes nothing."""
+    values = (np.zeros(size), np.ones(size), np.inf)
+    if statistics is not None:
+        values = (statistics.mean, statistics.std, OBSERVATION_LIMIT)
+    names = ("observation_mean", "observation_std", "observation_limit")
+    return {name: np.asarray(value, np.float32) for name, value in zip(names, values, strict=True)}
+
+
+def _layers(network: str, params: Any) -> Arrays:
+    """Of the modules in `learn.networks`: the layers of the torso, then the head, which is the policy's mean."""
+    torso, head = (params["params"].get(name, {}) for name in ("Torso_0", "Dense_0"))
+    layers = [*(torso[f"Dense_{i}"] for i in range(len(torso))), head]
+    parts = {"weight": "kernel", "bias": "bias"}
+    return {f"{network}_{ours}_{i}": np.asarray(layer[name]) for i, layer in enumerate(layers) for ours, name in parts.items()}
+
+
+def _compare(arrays: Arrays, policy: Policy, found: Trained) -> None:
+    ours = outside.Policy(io.BytesIO(packed(arrays)))
+    spread = np.random.default_rng(0).normal(size=(100, policy.observation_size))
+    obs = arrays["observation_mean"] + 3 * spread * arrays["observation_std"]
+    outputs = {"actions": (ours(obs), policy(obs)), "quantiles": (ours.quantiles(obs), policy.quantiles(obs))}
+    for name, (a, b) in outputs.items():
+        if a.shape != b.shape or not np.allclose(a, b, rtol=TOLERANCE, atol=TOLERANCE):
+            raise _foreign(found, f"as plain layers their {name} differ")
+
+
+def _foreign(found: Trained, why: str) -> ConfigError:
+    return ConfigError(f"{found.path}: must have networks of dgae_jax's own make to be exported; {why}")

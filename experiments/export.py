@@ -1,0 +1,8 @@
+"""Take a trained policy out of a run: python experiments/export.py RUN_DIR --to npz"""
+
+import sys
+
+from dgae_jax.cli.export import main
+
+if __name__ == "__main__":
+    sys.exit(main())
