@@ -1,6 +1,7 @@
 """The model card beside an exported policy: what it is, what it is worth, how it is used. It says what the run's files say, no more."""
 
 from collections.abc import Mapping
+from dataclasses import asdict
 
 import numpy as np
 
@@ -60,6 +61,7 @@ def card(kind: str, arrays: Mapping[str, np.ndarray], config: Config, index: int
         f"actions [{sizes['actions']}]",
         "algorithm": str(config.algo),
         "trained on": f"{config.task}, engine {config.physics}, seed {config.seed + index}",
+        "noise in training": ", ".join(f"{where} {std:g}" for where, std in asdict(config.noise).items() if std),
         "samples": facts.samples and f"{facts.samples:,}",
         f"return in {task} ({engine})": facts.returns and f"{facts.returns}, mean ± standard deviation{chosen}",
         "critic": f"{config.critic.kind} [{sizes['quantiles']}], of the discounted return (γ = {config.gamma:g}){_scale(config)}",

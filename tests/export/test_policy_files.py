@@ -4,6 +4,7 @@ import dataclasses
 import json
 import subprocess
 import sys
+import tomllib
 from functools import partial
 
 import gymnasium
@@ -15,12 +16,13 @@ import pytest
 
 import dgae_jax as dg
 from dgae_jax.configs.config import ConfigError, resolve
-from dgae_jax.export import arrays, bundle
+from dgae_jax.export import arrays, bundle, card
 from dgae_jax.export.facts import facts_of
 from dgae_jax.export.outside.policy import Policy
 from dgae_jax.run import restore
 from dgae_jax.run.evaluation import evaluate_policies
 from dgae_jax.run.loop import train
+from tests.helpers import ROOT
 from tests.runs import QUIET, last, small
 
 LOUD = {"quantile": 100, "scalar": 30}
@@ -201,8 +203,8 @@ def test_the_card_says_what_the_runs_files_say(runs, tmp_path):
     cards = {kind: (tmp_path / kind / "README.md").read_text() for kind in bundle.FILES}
     evaluation, manifest = (json.loads((run_dir / name).read_text()) for name in ("evaluation.json", "manifest.json"))
     worth = f"{evaluation['return_mean']:,.1f} ± {evaluation['return_std']:,.1f} over 1 episodes"
-    for kind, card in cards.items():
-        assert card.startswith("# DPPO on Hopper-v4\n")
+    for kind, text in cards.items():
+        assert text.startswith("# DPPO on Hopper-v4\n")
         for row in (
             "| task | Hopper-v4, episodes of at most 20 steps, observations [11], actions [3] |",
             "| algorithm | dppo |",
@@ -213,13 +215,29 @@ def test_the_card_says_what_the_runs_files_say(runs, tmp_path):
             f"| checkpoint | {last(run_dir).name} |",
             "| licence | Apache-2.0, that of dgae_jax |",
         ):
-            assert row in card
-        assert f"jax {manifest['versions']['jax']}" in card
-        assert (manifest["git_revision"] or "git revision") in card or not manifest["git_revision"]
-        assert {"npz": "policy.py", "onnx": "onnxruntime", "gymnasium": "python agent.py"}[kind] in card
+            assert row in text
+        assert f"jax {manifest['versions']['jax']}" in text
+        assert ("git revision" in text) == bool(manifest["git_revision"])
+        assert (manifest["git_revision"] or "") in text
+        assert {"npz": "policy.py", "onnx": "onnxruntime", "gymnasium": "python agent.py"}[kind] in text
 
 
-def test_the_programs_on_the_cards_run_as_they_are_printed(exported, monkeypatch):
+def test_a_card_has_the_licence_of_the_package_and_the_noise_of_the_training(runs):
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    assert project["license"] == card.LICENCE
+    config, made = CONFIGS["scalar"], facts_of(runs["scalar"], last(runs["scalar"]), CONFIGS["scalar"], 1)
+    plain = arrays.arrays_of(restore.trained(runs["scalar"], config, "newest"), config, 1)
+    quiet, noisy = (
+        card.card("npz", plain, dataclasses.replace(config, noise=noise), 1, made, "newest")
+        for noise in (dg.NoiseConfig(), dg.NoiseConfig(reward=0.5, initial=0.01))
+    )
+    assert "noise" not in quiet
+    assert "| noise in training | reward 0.5, initial 0.01 |\n" in noisy
+    assert "| critic | scalar [1], of the discounted return (γ = 0.99) |\n" in quiet
+    assert "| trained on | hopper-v4, engine native, seed 1 |\n" in quiet
+
+
+def test_the_programs_on_the_cards_run_as_they_are_printed(exported):
     *_, directory = exported
     for kind in ("npz", "onnx"):
         _, block, _ = (directory / kind / "README.md").read_text().replace("```python\n", "```").split("```")
