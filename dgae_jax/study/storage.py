@@ -72,10 +72,8 @@ def open_study(tuning: Tuning, storage: RDBStorage, worker: int = 0) -> optuna.S
         pruner=optuna.pruners.MedianPruner(),
     )  # fmt: skip
     _agree(study, tuning)
-    if not study.get_trials(deepcopy=False):
-        values = values_of(tuning.config, tuning.space)
-        if all(values[path] in dimension for path, dimension in tuning.space.items()):
-            study.enqueue_trial(values, skip_if_exists=True)
+    if not study.get_trials(deepcopy=False) and not tuning.outside:
+        study.enqueue_trial(values_of(tuning.config, tuning.space), skip_if_exists=True)
     entropy = (tuning.sampler_seed, worker, len(study.get_trials(deepcopy=False)))  # one that goes on draws other numbers
     study.sampler = optuna.samplers.TPESampler(seed=int(np.random.SeedSequence(entropy).generate_state(1)[0]))
     return study

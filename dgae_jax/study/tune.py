@@ -34,6 +34,8 @@ def tune(tuning: Tuning) -> int:
     from dgae_jax.study.trials import finished, is_over
 
     study = open_study(tuning, open_storage(tuning))
+    for path, value in tuning.outside.items():
+        terminal.say(f"the start's own {path} {value} is outside of {tuning.space[path]}, so it is no trial")
     progress = outcome.Progress(study)
     with Signals() as signals:
         processes = [] if is_over(study, tuning) else start(tuning)

@@ -8,7 +8,7 @@ from typing import Any
 from dgae_jax.configs.config import Config
 from dgae_jax.configs.validation import validate
 from dgae_jax.run.options import RunOptions
-from dgae_jax.study.search import Space, with_values
+from dgae_jax.study.search import Space, values_of, with_values
 
 FIRST_SEED = 1000
 """Of the seeds that trials are trained with; reports use 0, 1, …, which no choice of settings has seen."""
@@ -40,6 +40,11 @@ class Tuning:
     sampler_seed: int = 0
     heartbeat: int = 20
     """Time between signs of life of a trial; one without for three times as long is taken over [s]."""
+
+    @property
+    def outside(self) -> dict[str, Any]:
+        """The configuration's own values that are not among those searched; with any, it is no trial itself."""
+        return {path: value for path, value in values_of(self.config, self.space).items() if value not in self.space[path]}
 
     def config_of(self, values: dict[str, Any]) -> Config:
         """What a trial trains; raises ConfigError if its values do not go together."""

@@ -92,6 +92,14 @@ def test_a_tuning_finishes_as_many_trials_as_were_asked_for_and_leaves_them_in_a
     assert len({row["gamma"] for row in rows}) == 5
 
 
+def test_a_start_outside_of_what_is_searched_is_no_trial_and_said_to_be_none(tmp_path):
+    assert tuning(tmp_path / "within", "gamma=0.9:0.999").outside == {}
+    outside = tuning(tmp_path / "outside", "gamma=0.995:0.999")
+    assert outside.outside == {"gamma": 0.99}
+    assert opened(outside)[1].get_trials() == []
+    assert len(opened(tuning(tmp_path / "within", "gamma=0.9:0.999"))[1].get_trials()) == 1
+
+
 def test_the_first_trial_is_the_preset_itself(tuned):
     rows = table_of(tuned[0])
     assert (float(rows[0]["gamma"]), float(rows[0]["lam"])) == (0.99, 0.95)
