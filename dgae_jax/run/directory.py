@@ -148,9 +148,9 @@ def _lock(file) -> None:
 
 def read_config(path: Path) -> Config:
     """The configuration of a run; raises ConfigError if `path` is not a run directory, or one with links or devices in it."""
-    for name in ("checkpoints", "nonfinite"):
+    for name in ("checkpoints", "nonfinite", "tensorboard", "wandb", "mlflow"):
         _check_own(path / name, "directory", stat.S_ISDIR)
-    for name in ("config.json", "manifest.json", "metrics.jsonl", "evaluations.jsonl"):
+    for name in ("config.json", "manifest.json", "metrics.jsonl", "evaluations.jsonl", "sinks.json"):
         _check_own(path / name, "file", stat.S_ISREG)
     with contextlib.suppress(OSError):  # what cannot be read is missed below
         for file in path.glob("checkpoints/steps_*.msgpack"):

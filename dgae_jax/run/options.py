@@ -1,11 +1,15 @@
 """What a user may choose about a run beside its configuration."""
 
+import importlib.util
 import re
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from dgae_jax.configs.config import invalid
+from dgae_jax.configs.config import ConfigError, invalid
+
+SINKS = {"tensorboard": "tensorboardX", "wandb": "wandb", "mlflow": "mlflow"}
+"""Viewers of metrics that a run can feed, and the library that each takes."""
 
 
 @dataclass(frozen=True)
@@ -42,6 +46,11 @@ class RunOptions:
     """Episodes of every evaluation in Gymnasium, per run [episodes]."""
     debug_nonfinite: bool = False
     """Write the states and actions from which worlds turn non-finite to nonfinite/ in the run directory, for replay."""
+    log: tuple[str, ...] = ()
+    """Viewers that get the metrics too: tensorboard, wandb, mlflow; several may be named, --log alone means none."""
+
+    def __post_init__(self):
+        object.__setattr__(self, "log", tuple(self.log))  # a list, from Python or JSON
 
 
 WHOLE = {
@@ -62,6 +71,7 @@ def validate_options(options: RunOptions) -> None:
         value = getattr(options, name)
         if value is not None and not low <= value <= high:
             raise invalid(name, value, f"a whole number from {low:,} to {high:,} ({reason})")
+    _validate_log(options.log)
     if options.coordinator is not None:
         if not re.fullmatch(r"[^\s:]+:\d{1,5}", options.coordinator):
             raise invalid("coordinator", options.coordinator, "HOST:PORT")
@@ -83,17 +93,29 @@ def validate_options(options: RunOptions) -> None:
         raise invalid("inexact", True, "left out without --resume")
 
 
-_KEPT = ("devices", "checkpoint_every", "keep_checkpoints", "max_nonfinite", "episodes", "debug_nonfinite")
+def _validate_log(names: tuple[str, ...]) -> None:
+    for name in names:
+        if name not in SINKS:
+            raise invalid("log", name, f"one or more of {', '.join(SINKS)}")
+        if names.count(name) > 1:
+            raise invalid("log", names, "each viewer once")
+        spec = importlib.util.find_spec(SINKS[name])
+        if spec is None or spec.origin is None:  # a folder of that name in the working directory, such as Weights & Biases leaves
+            raise ConfigError(f'log {name}: {SINKS[name]} is missing; pip install "dgae_jax[{name}]"', "log")
+
+
+_KEPT = ("devices", "checkpoint_every", "keep_checkpoints", "max_nonfinite", "episodes", "debug_nonfinite", "log")
 """What a run goes on with when it is resumed."""
 
 
 def to_dict(options: RunOptions) -> dict[str, Any]:
     """What a run goes on with, for JSON."""
-    return {name: getattr(options, name) for name in _KEPT}
+    return {name: getattr(options, name) for name in _KEPT} | {"log": list(options.log)}
 
 
 def from_dict(data: Any) -> RunOptions:
     """What `to_dict` wrote; defaults for all else."""
     found = data if isinstance(data, dict) else {}
     usual = to_dict(RunOptions(devices=1))
-    return RunOptions(**{name: found[name] for name in _KEPT if type(found.get(name)) is type(usual[name])})
+    kept = {name: found[name] for name in _KEPT if type(found.get(name)) is type(usual[name])}
+    return RunOptions(**kept | {"log": [name for name in SINKS if name in kept.get("log", [])]})

@@ -21,6 +21,7 @@ from dgae_jax.run.evaluations import EvaluationsFile
 from dgae_jax.run.metrics import MetricsFile
 from dgae_jax.run.options import RunOptions
 from dgae_jax.run.signals import Stopped
+from dgae_jax.run.sinks.feed import Feed
 
 
 class Record:
@@ -35,6 +36,7 @@ class Record:
         self.metrics = MetricsFile(run_dir / "metrics.jsonl", config, done)
         self.evaluations = EvaluationsFile(run_dir / "evaluations.jsonl")
         self.evaluations.cut(done * config.samples_per_iteration, config.num_seeds)
+        self.feed = Feed(options.log if hosts.is_first() else (), run_dir, config, self.steps)
         self.began = time.monotonic() - self.metrics.seconds
         self.beside, self.pending = ThreadPoolExecutor(1), Future()
         self.pending.set_result(None)
@@ -44,6 +46,7 @@ class Record:
 
     def __exit__(self, kind: Any, *_) -> None:
         self.beside.shutdown()
+        self.feed.close(finished=kind is None)
         if kind is None or issubclass(kind, Stopped):
             self.pending.result()
 
@@ -64,6 +67,7 @@ class Record:
     def append(self, state: TrainState, measured: dict[str, Any], count: int) -> float | None:
         """Add `count` iterations to the metrics; the mean return of the last one, if there is any yet."""
         rows = self.metrics.append(measured, count, time.monotonic() - self.began)
+        self.feed.rows(rows)
         if self.options.debug_nonfinite:
             self._save_incidents(state, {row["seed"] for row in rows if row["nonfinite"]})
         returns = [row["episode_return"] for row in rows[-self.config.num_seeds :] if row["episode_return"] is not None]
@@ -79,6 +83,7 @@ class Record:
         result = evaluate_policies(policies, self.config, episodes=self.options.episodes, watch=watch)
         if not self.evaluated:
             self.evaluations.append(self.steps, result)
+            self.feed.evaluations([{"steps": self.steps, **one} for one in result["seeds"]])
         self.draw()
         return result
 

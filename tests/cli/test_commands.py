@@ -13,6 +13,7 @@ import pytest
 from dgae_jax.cli.main import COMMANDS
 from dgae_jax.cli.train import parsed
 from dgae_jax.run import directory, metrics
+from dgae_jax.run.options import SINKS
 from tests.helpers import ROOT, TINY, command
 
 
@@ -241,6 +242,18 @@ def test_a_resumed_run_starts_from_its_own_flags(trained):
     config, options = parsed(["--resume", str(trained[0]), "--episodes", "5"])
     assert config == directory.read_config(trained[0])
     assert (options.checkpoint_every, options.episodes, options.keep_checkpoints) == (300, 5, 3)
+
+
+def test_viewers_are_named_behind_one_flag_and_a_missing_one_is_refused_in_one_line_that_says_what_to_install(run, monkeypatch, tmp_path):
+    assert parsed(["--log", "tensorboard"])[1].log == ("tensorboard",)
+    assert parsed(["--log", "--env", "hopper"])[1].log == ()
+    monkeypatch.setitem(SINKS, "wandb", "a_library_that_nobody_has")
+    code, out, err = run("train", "--log", "tensorboard", "wandb", "--run-dir", tmp_path / "run")
+    assert (code, out) == (2, "")
+    assert err == 'error: --log wandb: a_library_that_nobody_has is missing; pip install "dgae_jax[wandb]"\n'
+    code, _, err = run("train", "--log", "visdom")
+    assert (code, err) == (2, "error: --log visdom: must be one or more of tensorboard, wandb, mlflow\n")
+    assert not (tmp_path / "run").exists()
 
 
 def test_an_output_that_is_no_file_is_left_alone(trained, run, tmp_path):
