@@ -17,7 +17,7 @@ ROWS = 200
 """Most rows of the source of a picture."""
 
 PANELS = (
-    ("episode_return", "reward", "linear"), ("episode_length", "environment steps", "linear"), ("episodes", "episodes", "log"),
+    ("episode_return", "reward", "linear"), ("episode_length", "environment steps", "linear"), ("episodes", "episodes", "linear"),
     ("reward", "reward", "linear"),
     ("policy/loss", "1", "linear"), ("policy/kl", "nats", "linear"), ("policy/clip_fraction", "1", "linear"),
     ("policy/entropy", "nats", "linear"),

@@ -65,20 +65,32 @@ def read_tensorboard(run_dir, seed):
     return found
 
 
+def records(path):
+    """The records of a file of Weights & Biases: a log as LevelDB has it, in blocks of 32 KiB, behind a header of 7 bytes."""
+    data, at, parts = path.read_bytes(), 7, b""
+    while at < len(data):
+        left = 32768 - at % 32768
+        if left < 7:
+            at += left
+            continue
+        _, size, kind = struct.unpack("<IHB", data[at : at + 7])
+        parts, at = parts + data[at + 7 : at + 7 + size], at + 7 + size
+        if kind in (1, 4):  # whole, or the last part
+            yield parts
+            parts = b""
+
+
 def read_wandb(run_dir, seed):
     """Of all files of the run's id, in their order."""
     from wandb.proto.wandb_internal_pb2 import Record
-    from wandb.sdk.internal.datastore import DataStore
 
     name, found = json.loads((run_dir / "sinks.json").read_text())["wandb"]["ids"][str(seed)], []
     for path in sorted(run_dir.glob(f"wandb/offline-run-*/run-{name}.wandb")):
-        store = DataStore()
-        store.open_for_scan(str(path))
-        while (data := store.scan_data()) is not None:
-            record = Record.FromString(data)
-            row = {item.key or ".".join(item.nested_key): json.loads(item.value_json) for item in record.history.item}
-            found += [(row["steps"], k, x) for k, x in row.items() if "steps" in row and k != "steps" and not k.startswith("_")]
-    return [each for each in found if isinstance(each[2], int | float)]
+        for record in map(Record.FromString, records(path)):
+            items = [item for item in record.history.item if len(item.nested_key) < 2]  # what has parts is a picture
+            row = {item.key or item.nested_key[0]: json.loads(item.value_json) for item in items}
+            found += [(row["steps"], k, x) for k, x in row.items() if k != "steps" and not k.startswith("_")]
+    return found
 
 
 def read_mlflow(run_dir, seed):

@@ -86,10 +86,10 @@ class Feed:
 
     def _open(self, name: str, done: int) -> None:
         noted, kind = self.state.setdefault(name, _noted({})), KINDS[name]
-        kept = min(done, noted["rows"])
         if kind.goes_back:
+            kept = min(done, noted["rows"])
             noted |= {"rows": kept, "evaluations": min(kept, noted["evaluations"])}
-        self.sinks[name] = kind.begin(Place(self.run_dir, self.config, noted["ids"], kept))
+        self.sinks[name] = kind.begin(Place(self.run_dir, self.config, noted["ids"], noted["rows"]))
         self._note()
         known = (row for row, _ in files.whole_rows(self.run_dir / "metrics.jsonl") if row["steps"] <= done)
         while chunk := list(itertools.islice(known, ITERATIONS * self.config.num_seeds)):

@@ -19,6 +19,7 @@ BATCH = 1000
 def begin(place: Place) -> Sink:
     """The run of each seed, begun or continued."""
     os.environ.setdefault("MLFLOW_DISABLE_TELEMETRY", "true")
+    os.environ.setdefault("MLFLOW_LOGGING_LEVEL", "WARNING")
     from mlflow import MlflowClient
     from mlflow.entities import Metric
 

@@ -21,7 +21,7 @@ class Place(NamedTuple):
     ids: dict[str, str]
     """By seed, how the viewer calls its run; empty at first, kept in the run directory from then on."""
     kept: int
-    """Samples of each run up to which the sink has what it was given; only a sink that goes back uses it."""
+    """Samples of each run up to which the sink has the metrics; what one that goes back has of later ones is not to be seen."""
 
 
 class Sink(NamedTuple):

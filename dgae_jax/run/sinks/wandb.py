@@ -1,7 +1,7 @@
 """Weights & Biases: files in RUN_DIR/wandb, sent while the run trains where there is a login and a network; one run per seed.
 
-Steps are counted in samples. Its own counter, which may only grow, has two numbers for each of them: the metrics' and the
-evaluation's. WANDB_MODE, WANDB_PROJECT and WANDB_ENTITY say what they say elsewhere.
+Steps are counted in samples. Its own counter, which may only grow, has two numbers for each of them, the metrics' and the
+evaluation's; pictures come behind the last. Several files of one run, of a resumed one, are sent in their order by `wandb sync`. WANDB_MODE, WANDB_PROJECT and WANDB_ENTITY say what they say elsewhere.
 """
 
 import os
@@ -21,7 +21,7 @@ def begin(place: Place) -> Sink:
     """The run of each seed, begun or continued."""
     import wandb
 
-    mode = _mode()
+    mode, last = _mode(), [place.kept]
     runs = {}
     for seed in seeds_of(place.config):
         name, known = name_of(place, seed), place.ids.setdefault(str(seed), secrets.token_hex(4))
@@ -44,6 +44,7 @@ def begin(place: Place) -> Sink:
     def rows(rows: list[Row]) -> None:
         for row in rows:
             runs[row["seed"]].log({"steps": row["steps"], **numbers(row)}, step=2 * row["steps"])
+            last[0] = row["steps"]
 
     def evaluations(rows: list[Row]) -> None:
         for row in rows:
@@ -53,7 +54,7 @@ def begin(place: Place) -> Sink:
         for run in runs.values():
             media = {path.name: (wandb.Image if path.suffix == ".png" else wandb.Video)(str(path)) for path in paths}
             if media:
-                run.log(media)
+                run.log(media, step=2 * last[0] + 2)
             run.finish(exit_code=0 if finished else 1)
 
     return Sink(rows, evaluations, close)
