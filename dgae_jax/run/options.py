@@ -117,5 +117,6 @@ def from_dict(data: Any) -> RunOptions:
     """What `to_dict` wrote; defaults for all else."""
     found = data if isinstance(data, dict) else {}
     usual = to_dict(RunOptions(devices=1))
-    kept = {name: found[name] for name in _KEPT if type(found.get(name)) is type(usual[name])}
-    return RunOptions(**kept | {"log": [name for name in SINKS if name in kept.get("log", [])]})
+    kept: dict[str, Any] = {name: found[name] for name in _KEPT if type(found.get(name)) is type(usual[name])}
+    viewers: dict[str, Any] = {"log": [name for name in SINKS if name in kept.get("log", [])]}
+    return RunOptions(**kept | viewers)

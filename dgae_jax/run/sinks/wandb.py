@@ -1,13 +1,15 @@
 """Weights & Biases: files in RUN_DIR/wandb, sent while the run trains where there is a login and a network; one run per seed.
 
 Steps are counted in samples. Its own counter, which may only grow, has two numbers for each of them, the metrics' and the
-evaluation's; pictures come behind the last. Several files of one run, of a resumed one, are sent in their order by `wandb sync`. WANDB_MODE, WANDB_PROJECT and WANDB_ENTITY say what they say elsewhere.
+evaluation's; pictures come behind the last. The files of a resumed run that stayed offline are sent in their order by `wandb sync`.
+WANDB_MODE, WANDB_PROJECT and WANDB_ENTITY say what they say elsewhere.
 """
 
 import os
 import secrets
 import socket
 from pathlib import Path
+from typing import Any
 from urllib.parse import urlsplit
 
 from dgae_jax.run import terminal
@@ -31,7 +33,7 @@ def begin(place: Place) -> Sink:
             group=place.run_dir.resolve().name,
             name=name,
             id=known,
-            resume="allow" if mode == "online" else None,
+            resume=None if mode == "offline" else "allow",
             mode=mode,
             reinit="create_new",
             settings=wandb.Settings(silent=True, console="off"),
@@ -60,7 +62,7 @@ def begin(place: Place) -> Sink:
     return Sink(rows, evaluations, close)
 
 
-def _mode() -> str:
+def _mode() -> Any:
     """What the user said; otherwise online if it can be, since nobody may be there to answer for a login."""
     import wandb
 
