@@ -19,18 +19,18 @@ REACH_SECONDS = 5.0
 
 def check(address: str | None) -> None:
     """Raise ConfigError if Ray is not installed or nobody answers at the address."""
+    named = address not in (None, "auto", "local")
+    host, _, port = str(address).removeprefix("ray://").rpartition(":")
+    if named and not (host and port.isdigit()):
+        raise invalid("address", address, "HOST:PORT of a cluster, or auto")
     if not find_spec("ray"):
         raise invalid("launcher", "ray", 'used with Ray installed: pip install "dgae_jax[ray]"')
-    if address in (None, "auto", "local"):
-        return
-    host, colon, port = address.removeprefix("ray://").rpartition(":")
-    if not (host and colon and port.isdigit()):
-        raise invalid("address", address, "HOST:PORT of a cluster, or auto")
-    try:
-        with socket.create_connection((host, int(port)), REACH_SECONDS):
-            pass
-    except (OSError, OverflowError) as reason:
-        raise invalid("address", address, f"where a Ray cluster answers ({reason})") from reason
+    if named:
+        try:
+            with socket.create_connection((host, int(port)), REACH_SECONDS):
+                pass
+        except (OSError, OverflowError) as reason:
+            raise invalid("address", address, f"where a Ray cluster answers ({reason})") from reason
 
 
 @contextlib.contextmanager

@@ -37,7 +37,7 @@ def postgres():
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
-    home = Path(tempfile.mkdtemp(prefix="dgae_jax-postgres-"))
+    home = Path(tempfile.mkdtemp(prefix="dgae_jax-postgres-", dir="/tmp"))  # TMPDIR may be where that user cannot go
     os.chown(home, user, -1)
     data, log = home / "data", home / "log"
 

@@ -181,6 +181,7 @@ def test_a_killed_process_loses_no_finished_trial_and_the_others_finish_its_own(
     assert (len(lost), len(again)) == (1, 1)
 
 
+@pytest.mark.slow
 def test_a_signal_stops_it_with_its_exit_code_and_the_same_command_goes_on_where_it_was(tmp_path):
     study = tmp_path / "study"
     more = ["--trials", "2", "--workers", "1", "--total-steps", str(64 * 600)]
@@ -214,6 +215,7 @@ def test_machines_without_a_common_disk_share_a_study_in_postgresql(postgres, tm
     assert not (places[0] / "optuna.db").exists()
 
 
+@pytest.mark.slow
 def test_a_process_that_is_killed_is_made_up_for_through_postgresql_too(postgres, tmp_path):
     slow = dataclasses.replace(small(), total_steps=64 * 200)
     url = postgres.replace("postgresql:", "postgresql+psycopg:")
