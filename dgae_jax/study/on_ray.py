@@ -36,7 +36,7 @@ def check(address: str | None) -> None:
 @contextlib.contextmanager
 def launch(jobs: Sequence[Job], options: Any) -> Iterator[dict[Any, Job]]:
     """All jobs as tasks; leaving it gives up those that are not done, and their cells stop with a checkpoint."""
-    import ray
+    import ray  # pyright: ignore[reportMissingImports]
 
     try:
         ray.init(options.address or "local", log_to_driver=False, logging_level=logging.ERROR, ignore_reinit_error=True)
