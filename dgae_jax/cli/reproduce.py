@@ -42,7 +42,7 @@ class Arguments:
     scale: float = 1.0
     """Fraction of the preset's samples [1]."""
     seeds_per_run: int = 1
-    """Seeds that are trained side by side in one program: all of them is the fastest on a GPU, 1 on CPUs with native [runs]."""
+    """Seeds that are trained side by side in one program: 1 is the fastest on a CPU, more are meant for a GPU [runs]."""
     launch: Annotated[LaunchOptions, tyro.conf.arg(name="")] = field(default_factory=LaunchOptions)
 
 
