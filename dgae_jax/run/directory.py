@@ -15,6 +15,7 @@ import tempfile
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import IO
 
 from dgae_jax.configs.config import Config, ConfigError, invalid
 from dgae_jax.configs.serial import from_dict, to_dict
@@ -133,15 +134,16 @@ def locked(path: Path) -> Iterator[None]:
     except OSError as reason:
         raise ConfigError(f"{path}: must be a directory that can be written ({reason.strerror})") from reason
     with file:
-        _lock(file)
+        hold(file, InUseError(f"{path}: must not be in use; another process is training there"))
         yield
 
 
-def _lock(file) -> None:
+def hold(file: IO, in_use: ConfigError) -> None:
+    """Lock an open file until it is closed; raises `in_use` if another process holds it."""
     try:
         fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError:
-        raise InUseError(f"{Path(file.name).parent}: must not be in use; another process is training there") from None
+        raise in_use from None
     except OSError as reason:  # some network file systems have no locks
         terminal.warn(f"warning: {file.name} cannot be locked ({reason.strerror}): train in it with one process only")
 

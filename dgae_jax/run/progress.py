@@ -46,7 +46,7 @@ class Reporter:
         """`speed` in samples of one run per second; returns may not exist yet."""
         left = (self.total - steps) / speed
         shown = "–" if mean_return is None else f"{mean_return:,.1f}"
-        text = f"{steps:,} of {self.total:,} steps  {speed * self.runs:,.0f} steps/s  return {shown}  {_clock(left)} left"
+        text = f"{steps:,} of {self.total:,} steps  {speed * self.runs:,.0f} steps/s  return {shown}  {clock(left)} left"
         if self.bar:
             self.bar.update(self.task, completed=steps)
         (self.announce if steps >= self.total and not self.bar else self.watch)(text)
@@ -56,7 +56,8 @@ class Reporter:
             self.bar.stop()
 
 
-def _clock(seconds: float) -> str:
+def clock(seconds: float) -> str:
+    """Hours, minutes and seconds."""
     minutes, rest = divmod(round(seconds), 60)
     hours, minutes = divmod(minutes, 60)
     return f"{hours}:{minutes:02d}:{rest:02d}"

@@ -103,20 +103,14 @@ _MEANT_FOR = {
     "gpus_per_run": ("ray", "slurm"),
     "slurm": ("slurm",),
 }
+"""The launchers that take a setting."""
 
 
 def launcher(options: LaunchOptions) -> Launcher:
     """The one that is asked for, after a look at everything that can be seen at once; raises ConfigError."""
     found = lookup("launcher", options.launcher, LAUNCHERS)
     usual = LaunchOptions()
-    only = {
-        "processes": ("local",),
-        "address": ("ray",),
-        "cpus_per_run": ("ray", "slurm"),
-        "gpus_per_run": ("ray", "slurm"),
-        "slurm": ("slurm",),
-    }
-    for name, meant in only.items():
+    for name, meant in _MEANT_FOR.items():
         value = getattr(options, name)
         if value != getattr(usual, name) and options.launcher not in meant:
             raise invalid(name, value, f"left out with --launcher {options.launcher}")

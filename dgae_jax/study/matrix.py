@@ -9,16 +9,15 @@ STUDY/policies/CELL.msgpack   the policy at the end
 
 import contextlib
 import dataclasses
-import fcntl
 import itertools
 import json
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import NamedTuple, TextIO
+from typing import NamedTuple
 
 from dgae_jax.configs.config import Config, ConfigError, invalid
 from dgae_jax.configs.serial import differences, from_dict, to_dict
-from dgae_jax.run import files, terminal
+from dgae_jax.run import directory, files
 
 SCHEMA = 1
 """Version of `study.json`."""
@@ -90,7 +89,7 @@ def opened(path: Path, cells: Sequence[Cell], command: str) -> Iterator[Study]:
             raise ConfigError(f"study {path}: must be a study, or a new or empty directory")
         path.mkdir(parents=True, exist_ok=True)
         with (path / ".lock").open("w") as lock:
-            _hold(lock, path)
+            directory.hold(lock, ConfigError(f"study {path}: must not be in use; another process runs it"))
             before = read(path) if (path / "study.json").exists() else Study(path, (), {})
             study = _joined(before, cells, command)
             for part in ("runs", "logs", "policies"):
@@ -101,15 +100,6 @@ def opened(path: Path, cells: Sequence[Cell], command: str) -> Iterator[Study]:
             yield study
     except OSError as reason:
         raise ConfigError(f"study {path}: must be a directory that can be written ({reason.strerror})") from reason
-
-
-def _hold(lock: TextIO, path: Path) -> None:
-    try:
-        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
-        raise ConfigError(f"study {path}: must not be in use; another process runs it") from None
-    except OSError as reason:  # some network file systems have no locks
-        terminal.warn(f"warning: {path} cannot be locked ({reason.strerror}): run one study in it at a time")
 
 
 def _joined(before: Study, cells: Sequence[Cell], command: str) -> Study:

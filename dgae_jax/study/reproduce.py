@@ -2,7 +2,8 @@
 
 import contextlib
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager
 from typing import Any
 
 import numpy as np
@@ -11,21 +12,23 @@ from dgae_jax.run import terminal
 from dgae_jax.run.options import RunOptions
 from dgae_jax.run.signals import Signals
 from dgae_jax.study import results
-from dgae_jax.study.launch import LaunchOptions, Task, launcher
+from dgae_jax.study.launch import Task
 from dgae_jax.study.matrix import Cell, Study
 from dgae_jax.study.view import View
 from dgae_jax.study.work import Job
+
+Launch = Callable[[Sequence[Job]], AbstractContextManager[dict[Task, Job]]]
+"""Puts all jobs on their way: a launcher with its options."""
 
 LOOK_EVERY = 0.5
 """Seconds between looks at the tasks."""
 
 
-def reproduce(study: Study, cells: Sequence[Cell], options: RunOptions, launch: LaunchOptions) -> int:
+def reproduce(study: Study, cells: Sequence[Cell], options: RunOptions, launch: Launch) -> int:
     """Train the cells that are not done, and keep `results.jsonl` up to date.
 
     0 all are done; 1 some failed; 128 + the signal if one came: the same call goes on. Raises ConfigError if the launcher cannot start.
     """
-    begin = launcher(launch)
     rows = results.of_study(study)
     results.write(study, rows)
     jobs = [Job(study, cell, options) for cell in cells if cell.name not in rows]
@@ -34,7 +37,7 @@ def reproduce(study: Study, cells: Sequence[Cell], options: RunOptions, launch: 
     with (
         Signals() as signals,
         View(study, [job.cell for job in jobs]) as view,
-        begin(jobs, launch) if jobs else contextlib.nullcontext({}) as tasks,
+        launch(jobs) if jobs else contextlib.nullcontext({}) as tasks,
     ):
         waiting = dict(tasks)
         while waiting and not signals.anywhere():

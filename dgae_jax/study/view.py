@@ -14,6 +14,7 @@ from rich.live import Live
 from rich.table import Table
 
 from dgae_jax.run import terminal
+from dgae_jax.run.progress import clock
 from dgae_jax.study.matrix import Cell, Study
 
 PLAIN_EVERY = 30.0
@@ -60,14 +61,14 @@ class View:
         if self.live:
             self.live.stop()
 
-    def note(self, cell: Cell, state: str, text: str | None = None, mean_return: float | None = None) -> None:
-        """A cell is done, failed or stopped; `text` is a line that says so."""
+    def note(self, cell: Cell, state: str, text: str, mean_return: float | None = None) -> None:
+        """A cell is done or failed; `text` is a line that says so."""
         self.state[cell.name] = state
         if mean_return is not None:
             self.returns[cell.name] = mean_return
-        if text and self.live:
+        if self.live:
             self.live.console.print(text, markup=False, highlight=False)
-        elif text:
+        else:
             terminal.say(text)
 
     def look(self) -> None:
@@ -86,16 +87,16 @@ class View:
 
     def _line(self, far: dict[str, Reached]) -> str:
         count = Counter(self.state.values())
-        parts = [f"{count[state]} {state}" for state in ("done", "running", "waiting", "failed", "stopped") if count[state]]
+        parts = [f"{count[state]} {state}" for state in ("done", "running", "waiting", "failed") if count[state]]
         return f"{', '.join(parts)} of {len(self.cells)} cells; {self._left(far)}"
 
     def _left(self, far: dict[str, Reached]) -> str:
         """At the speed so far."""
-        seconds, ours = time.monotonic() - self.began, [cell for cell in self.cells if self.state[cell.name] not in ("failed", "stopped")]
+        seconds, ours = time.monotonic() - self.began, [cell for cell in self.cells if self.state[cell.name] != "failed"]
         made = sum((far[cell.name].steps - self.before[cell.name]) * cell.config.num_seeds for cell in ours)
         total = sum(cell.config.iterations * cell.config.samples_per_iteration * cell.config.num_seeds for cell in ours)
         there = sum(far[cell.name].steps * cell.config.num_seeds for cell in ours)
-        left = f"about {_clock((total - there) * seconds / made)} left" if made else "time left not known yet"
+        left = f"about {clock((total - there) * seconds / made)} left" if made else "time left not known yet"
         return f"{there:,} of {total:,} steps, {left}"
 
     def _table(self, far: dict[str, Reached]) -> Group:
@@ -116,9 +117,3 @@ class View:
         known = [x for x in found if x is not None]
         shown = f"{np.mean(known):,.0f}" if known else "–"
         return [*(str(states.count(state) or "") for state in ("done", "running", "failed")), f"{share:.0%}", shown]
-
-
-def _clock(seconds: float) -> str:
-    minutes, rest = divmod(round(seconds), 60)
-    hours, minutes = divmod(minutes, 60)
-    return f"{hours}:{minutes:02d}:{rest:02d}"
