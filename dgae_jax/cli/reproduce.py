@@ -7,7 +7,6 @@ import dataclasses
 import shlex
 import sys
 from dataclasses import dataclass, field
-from functools import partial
 from pathlib import Path
 from typing import Annotated
 
@@ -53,7 +52,7 @@ def main() -> int:
     try:
         arguments, rest = parse_known(Arguments, "Train the cells of a study; every flag of dgae train may follow.", sys.argv[1:])
         cells, options = _cells(arguments, rest)
-        launch = partial(launcher(arguments.launch), options=arguments.launch)
+        launch = launcher(arguments.launch)
         with matrix.opened(arguments.study, cells, shlex.join(["dgae", "reproduce", *sys.argv[1:]])) as study:
             from dgae_jax.study.reproduce import reproduce
 

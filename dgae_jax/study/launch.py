@@ -106,7 +106,11 @@ _MEANT_FOR = {
 """The launchers that take a setting."""
 
 
-def launcher(options: LaunchOptions) -> Launcher:
+Launch = Callable[[Sequence[Job]], AbstractContextManager[dict[Task, Job]]]
+"""A launcher that knows its options."""
+
+
+def launcher(options: LaunchOptions) -> Launch:
     """The one that is asked for, after a look at everything that can be seen at once; raises ConfigError."""
     found = lookup("launcher", options.launcher, LAUNCHERS)
     usual = LaunchOptions()
@@ -124,4 +128,4 @@ def launcher(options: LaunchOptions) -> Launcher:
         on_ray.check(options.address)
     if options.launcher == "slurm":
         on_slurm.check(options.slurm, options.gpus_per_run)
-    return found
+    return lambda jobs: found(jobs, options)

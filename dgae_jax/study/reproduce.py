@@ -2,8 +2,7 @@
 
 import contextlib
 import time
-from collections.abc import Callable, Sequence
-from contextlib import AbstractContextManager
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -12,13 +11,10 @@ from dgae_jax.run import terminal
 from dgae_jax.run.options import RunOptions
 from dgae_jax.run.signals import Signals
 from dgae_jax.study import results
-from dgae_jax.study.launch import Task
+from dgae_jax.study.launch import Launch, Task
 from dgae_jax.study.matrix import Cell, Study
 from dgae_jax.study.view import View
 from dgae_jax.study.work import Job
-
-Launch = Callable[[Sequence[Job]], AbstractContextManager[dict[Task, Job]]]
-"""Puts all jobs on their way: a launcher with its options."""
 
 LOOK_EVERY = 0.5
 """Seconds between looks at the tasks."""
