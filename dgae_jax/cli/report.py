@@ -29,7 +29,7 @@ class Arguments:
     """Film a typical run of each task for the page: of the best algorithm, the seed in the middle; they stay in STUDY/videos."""
     markdown: Path | None = None
     """A Markdown file in which the tables between `<!-- dgae report: NAME -->` and `<!-- /dgae report -->` are replaced; NAME is
-    returns, reach or speed [path]."""
+    returns, attribution, reach or speed [path]."""
 
 
 def main() -> int:

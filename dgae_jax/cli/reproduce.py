@@ -15,12 +15,13 @@ import tyro
 from dgae_jax.cli import train
 from dgae_jax.cli.arguments import fail, parse_known
 from dgae_jax.configs.algorithms import TABLE
-from dgae_jax.configs.config import Config, ConfigError, invalid
+from dgae_jax.configs.config import Config, ConfigError, invalid, lookup
 from dgae_jax.envs.registry import TASKS
 from dgae_jax.run import terminal
 from dgae_jax.run.options import RunOptions, to_dict
 from dgae_jax.study import matrix
 from dgae_jax.study.launch import LaunchOptions, launcher
+from dgae_jax.study.variants import VARIANTS
 
 
 @dataclass(frozen=True)
@@ -37,6 +38,8 @@ class Arguments:
     """Tasks."""
     algos: tuple[str, ...] = tuple(TABLE)
     """Algorithms."""
+    variants: str | None = None
+    """Instead of the algorithms, all variants of one question: attribution, attribution-noise or risk."""
     seeds: tuple[int, ...] = (0, 1, 2, 3, 4)
     """Seeds [1]."""
     scale: float = 1.0
@@ -76,18 +79,31 @@ def _cells(arguments: Arguments, rest: list[str]) -> tuple[list[matrix.Cell], Ru
         raise invalid("seeds_per_run", arguments.seeds_per_run, f"a whole number from 1 to the number of seeds, {len(arguments.seeds)}")
     if arguments.scale != 1 and any(word.partition("=")[0].replace("_", "-") == "--total-steps" for word in rest):
         raise invalid("scale", arguments.scale, "left out with --total-steps")
-    if arguments.config and len(arguments.algos) > 1:
+    if arguments.config and arguments.variants is None and len(arguments.algos) > 1:
         raise invalid("config", arguments.config, "used with one of --algos")
+    kinds = _kinds(arguments)
     options = RunOptions()
 
-    def make(task: str, algo: str) -> Config:
+    def make(task: str, kind: str) -> Config:
         nonlocal options
         start = ["--config", str(arguments.config)] if arguments.config else ["--preset", arguments.preset]
-        config, options = train.parsed([*start, "--env", task, "--algo", algo, *rest])
+        algo, *words = kinds[kind].split()
+        config, options = train.parsed([*start, "--env", task, "--algo", algo, *words, *rest])
         _refuse(config, options, task, algo)
         return config if arguments.scale == 1 else dataclasses.replace(config, total_steps=int(arguments.scale * config.total_steps))
 
-    return matrix.matrix(arguments.envs, arguments.algos, arguments.seeds, arguments.seeds_per_run, make), options
+    return matrix.matrix(arguments.envs, list(kinds), arguments.seeds, arguments.seeds_per_run, make), options
+
+
+def _kinds(arguments: Arguments) -> dict[str, str]:
+    """What is trained on each task by its name: an algorithm, and flags."""
+    if arguments.variants is None:
+        return {algo: algo for algo in arguments.algos}
+    if arguments.config:
+        raise invalid("config", arguments.config, "left out with --variants, each of which has an algorithm of its own")
+    if arguments.algos != Arguments.algos:
+        raise invalid("algos", arguments.algos, "left out with --variants")
+    return lookup("variants", arguments.variants, VARIANTS)
 
 
 def _refuse(config: Config, options: RunOptions, task: str, algo: str) -> None:

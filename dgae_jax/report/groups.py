@@ -22,7 +22,8 @@ class Group:
     task: str
     algo: str
     variant: str
-    """What differs from the first settings of this task and algorithm; empty for those themselves."""
+    """Its name among the variants of a question; else what differs from the first settings of this task and algorithm, empty for
+    those themselves."""
     number: int
     """0 for the first settings, 1 for the next."""
     rows: tuple[Row, ...]
@@ -45,11 +46,11 @@ class Group:
 
 def groups_of(rows: Iterable[Row]) -> list[Group]:
     """All groups, by task and algorithm in the order of their tables, then by the name of their first cell."""
-    by_kind: dict[tuple[str, str], dict[str, list[Row]]] = {}
+    by_kind: dict[tuple[str, str], dict[tuple[str | None, str], list[Row]]] = {}
     for row in sorted(rows, key=order):
-        by_kind.setdefault((row.task, row.algo), {}).setdefault(row.hash, []).append(row)
+        by_kind.setdefault((row.task, row.algo), {}).setdefault((row.variant, row.hash), []).append(row)
     return [
-        Group(task, algo, _variant(next(iter(variants.values()))[0], members[0]) if number else "", number, tuple(members))
+        Group(task, algo, _variant(next(iter(variants.values()))[0], members[0], number), number, tuple(members))
         for (task, algo), variants in by_kind.items()
         for number, members in enumerate(variants.values())
     ]
@@ -81,7 +82,9 @@ def order(row: Row) -> tuple:
     return place, row.task, list(TABLE).index(row.algo), row.cell, row.seed
 
 
-def _variant(first: Row, other: Row, most: int = 3) -> str:
+def _variant(first: Row, other: Row, number: int, most: int = 3) -> str:
+    if other.variant or not number:
+        return other.variant or ""
     ours, theirs = flat(first.config), flat(other.config)
     differ = [name for name in {**ours, **theirs} if name not in SEEDS and ours.get(name) != theirs.get(name)]
     named = [f"{name} {shown(theirs.get(name))}" for name in differ[:most]] or [other.hash]

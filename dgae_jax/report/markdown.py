@@ -12,7 +12,9 @@ from dgae_jax.report import tables
 from dgae_jax.report.groups import Group
 from dgae_jax.run import files
 
-TABLES: dict[str, Callable[[Sequence[Group]], tables.Table]] = {"returns": tables.returns, "reach": tables.reach, "speed": tables.speed}
+TABLES: dict[str, Callable[[Sequence[Group]], tables.Table]] = {
+    "returns": tables.returns, "attribution": tables.attribution, "reach": tables.reach, "speed": tables.speed
+}  # fmt: skip
 
 _MARKER = re.compile(r"^<!-- (?:dgae report: (?P<name>.*?)|(?P<end>/dgae report)) -->$", re.MULTILINE)
 

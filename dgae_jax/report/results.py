@@ -27,6 +27,8 @@ class Row:
     env: str
     env_version: str | None
     algo: str
+    variant: str | None
+    """Its name among the variants of a question; None in a study of algorithms."""
     seed: int
     total_steps: int
     hash: str
@@ -52,8 +54,9 @@ class Row:
 
     @property
     def task(self) -> str:
-        """The task with its version, where it has one."""
-        return f"{self.env}-{self.env_version}" if self.env_version else self.env
+        """The task with its version, where it has one, and whether there is noise on it."""
+        noise = " with noise" if any((self.config.get("noise") or {}).values()) else ""
+        return (f"{self.env}-{self.env_version}" if self.env_version else self.env) + noise
 
 
 @dataclass(frozen=True)
@@ -142,7 +145,8 @@ _WHOLE, _NUMBER, _OBJECT = (_is(int), "a whole number"), (_number, "a number"), 
 
 FIELDS = {
     "cell": _TEXT, "env": _TEXT, "env_version": _TEXT_OR_NONE, "algo": (TABLE.__contains__, f"one of {', '.join(TABLE)}"),
-    "seed": _WHOLE, "total_steps": _WHOLE, "hash": _TEXT, "final": _OBJECT, "final.engine": _TEXT, "final.return_mean": _NUMBER,
+    "variant": _TEXT_OR_NONE, "seed": _WHOLE, "total_steps": _WHOLE, "hash": _TEXT, "final": _OBJECT, "final.engine": _TEXT,
+    "final.return_mean": _NUMBER,
     "best": (_is(dict, type(None)), "an object or null"), "curve": _OBJECT,
     "curve.steps": (_list(_is(int)), "a list of whole numbers"),
     "curve.return": (_list(lambda value: value is None or _number(value)), "a list of numbers, null where there is none"),
@@ -161,8 +165,8 @@ def _row(data: dict[str, Any], where: str) -> Row:
     steps, returns = np.array(found["curve.steps"], float), np.array(found["curve.return"], float)
     if len(steps) != len(returns) or (np.diff(steps) <= 0).any():
         raise ConfigError(f"{where}: curve: must have increasing steps and a return for each")
-    same = ("cell", "env", "env_version", "algo", "seed", "total_steps", "hash", "seconds", "samples_per_second", "config", "versions",
-            "machine", "git_revision", "command")  # fmt: skip
+    same = ("cell", "env", "env_version", "algo", "variant", "seed", "total_steps", "hash", "seconds", "samples_per_second", "config",
+            "versions", "machine", "git_revision", "command")  # fmt: skip
     return Row(
         **{name: found[name] for name in same},
         engine=found["final.engine"],

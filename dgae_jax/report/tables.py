@@ -37,6 +37,17 @@ def _returns(group: Group) -> tuple[str, ...]:
     )  # fmt: skip
 
 
+def attribution(groups: Iterable[Group]) -> Table:
+    """Final returns of variants, and the difference of their interquartile means from that of the first of the task."""
+    rows = [
+        (group.task, group.name, str(len(group.rows)), spread(group.finals), between(analysis.interquartile_mean(group)),
+         NONE if group is members[0] else _difference(members[0], group))
+        for members in by_task(groups).values()
+        for group in members
+    ]  # fmt: skip
+    return Table(("task", "variant", "seeds", "mean ± std", "IQM [95 %]", "difference from the first [95 %]"), rows)
+
+
 def reach(groups: Iterable[Group]) -> Table:
     """Samples after which the mean over seeds of the training return reaches shares of the best mean of the task."""
     rows = []

@@ -11,6 +11,7 @@ import contextlib
 import dataclasses
 import itertools
 import json
+import re
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -22,13 +23,22 @@ from dgae_jax.run import directory, files
 SCHEMA = 1
 """Version of `study.json`."""
 
+NAME = re.compile(r"\w[\w.+-]{,199}")
+"""What a cell may be called."""
+
 
 class Cell(NamedTuple):
     """One run of a study."""
 
     name: str
-    """ENV-ALGO-SEED, and the last of its seeds where it trains several."""
+    """ENV-ALGO-SEED, or ENV-VARIANT-SEED, and the last of its seeds where it trains several."""
     config: Config
+
+    @property
+    def kind(self) -> str:
+        """The algorithm or the variant."""
+        before, after = _name(self.config.env, "/", range(self.config.seed, self.config.seed + self.config.num_seeds)).split("/")
+        return self.name.removeprefix(before).removesuffix(after)
 
 
 class Study(NamedTuple):
@@ -53,15 +63,18 @@ class Study(NamedTuple):
 
 
 def matrix(
-    tasks: Sequence[str], algos: Sequence[str], seeds: Sequence[int], per_run: int, make: Callable[[str, str], Config]
+    tasks: Sequence[str], kinds: Sequence[str], seeds: Sequence[int], per_run: int, make: Callable[[str, str], Config]
 ) -> list[Cell]:
-    """Tasks × algorithms × seeds, the first seeds of all first; `make(task, algo)` is the configuration of a pair.
+    """Tasks × kinds × seeds, the first seeds of all first; a kind is an algorithm or a variant.
 
-    `per_run` seeds, which must follow each other, are trained side by side in one run.
+    `make(task, kind)` is the configuration of a pair. `per_run` seeds, which must follow each other, are trained side by side in
+    one run.
     """
-    configs = [make(task, algo) for task, algo in itertools.product(tasks, algos)]
-    seeded = ((config, some) for some in _groups(seeds, per_run) for config in configs)
-    return [_cell(dataclasses.replace(config, seed=some[0], num_seeds=len(some))) for config, some in seeded]
+    configs = {(task, kind): make(task, kind) for task, kind in itertools.product(tasks, kinds)}
+    seeded = ((task, kind, config, some) for some in _groups(seeds, per_run) for (task, kind), config in configs.items())
+    return [
+        Cell(_name(task, kind, some), dataclasses.replace(config, seed=some[0], num_seeds=len(some))) for task, kind, config, some in seeded
+    ]
 
 
 def _groups(seeds: Sequence[int], per_run: int) -> Iterator[Sequence[int]]:
@@ -72,9 +85,13 @@ def _groups(seeds: Sequence[int], per_run: int) -> Iterator[Sequence[int]]:
         yield some
 
 
-def _cell(config: Config) -> Cell:
-    last = f"-{config.seed + config.num_seeds - 1}" if config.num_seeds > 1 else ""
-    return Cell(f"{config.env.replace(':', '_')}-{config.algo}-{config.seed}{last}", config)
+def _name(task: str, kind: str, seeds: Sequence[int]) -> str:
+    last = f"-{seeds[-1]}" if len(seeds) > 1 else ""
+    return f"{_file_name(task)}-{kind}-{seeds[0]}{last}"
+
+
+def _file_name(task: str) -> str:
+    return task.replace(":", "_")
 
 
 @contextlib.contextmanager
@@ -118,9 +135,9 @@ def read(path: Path) -> Study:
         if data["schema"] != SCHEMA:
             raise ConfigError(f"{path / 'study.json'}: has schema {data['schema']}, this version reads {SCHEMA}")
         cells = tuple(Cell(name, from_dict(config)) for name, config in data["cells"].items())
-        for name, config in cells:
-            if name != _cell(config).name:  # it becomes the name of files
-                raise ValueError(f"cell {name[:100]!r} is named otherwise")
+        for name, _ in cells:
+            if not NAME.fullmatch(name):  # it becomes the name of files
+                raise ValueError(f"cell {name[:100]!r} has no such name")
         return Study(path, cells, dict(data["commands"]))
     except OSError as reason:
         raise ConfigError(f"study {path}: must be the directory of a study ({reason.strerror})") from reason

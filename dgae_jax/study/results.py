@@ -46,6 +46,7 @@ def rows_of(study: Study, cell: Cell) -> list[dict[str, Any]]:
     head = {
         "cell": cell.name,
         **{name: getattr(config, name) for name in ("env", "env_version", "algo", "physics")},
+        "variant": None if cell.kind == config.algo else cell.kind,
     }
     tail = {
         "seconds": trained[-1]["seconds"],

@@ -23,7 +23,7 @@ def row(env="hopper", algo="dppo", seed=0, **changes):
     best = {"steps": 800_000, "return_mean": height + 50, "return_std": 10.0, "returns": [height + 50] * 20}
     found = {
         "cell": f"{env}-{algo}-{seed}", "env": env, "env_version": config["env_version"], "algo": algo, "physics": config["physics"],
-        "seed": seed, "total_steps": 1_000_000, "steps": 999_424, "hash": f"{env}{algo}".ljust(12, "0")[:12],
+        "variant": None, "seed": seed, "total_steps": 1_000_000, "steps": 999_424, "hash": f"{env}{algo}".ljust(12, "0")[:12],
         "final": {
             "engine": "gymnasium", "env": env, "episodes": 20, "return_mean": float(returns.mean()), "return_std": float(returns.std()),
             "returns": returns.tolist(),

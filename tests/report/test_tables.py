@@ -4,7 +4,7 @@ import pytest
 
 from dgae_jax.configs.config import ConfigError
 from dgae_jax.report import markdown, tables
-from tests.report.rows import plain
+from tests.report.rows import plain, row
 
 
 def test_final_returns_are_mean_std_iqm_best_and_each_seed(grouped):
@@ -38,6 +38,23 @@ def test_two_studies_are_compared_where_both_have_results(grouped):
         ("hopper-v4", "PPO", "4 [–]", "–", "–"),
         ("hopper-v4", "DPPO", "2 [1, 3]", "10 [10, 10]", "+8 [+7, +9]"),
         ("hopper-v4", "A2C", "–", "7 [7, 7]", "–"),
+    ]
+
+
+def test_variants_are_named_and_compared_with_the_first_of_their_task_noise_making_another_task(grouped):
+    noise = row("hopper", "dppo")["config"] | {"noise": {"reward": 0.5}}
+    scalar = plain([1, 3], algo="ppo", variant="scalar", cell="hopper-scalar")
+    rows = [
+        *scalar,
+        *plain([10, 10], variant="bellman", cell="hopper-bellman", hash="another"),
+        *plain([5, 5], variant="kappa", cell="hopper-kappa"),
+        *plain([7], variant="kappa+noise", cell="hopper-kappa+noise", config=noise, hash="third"),
+    ]
+    assert tables.attribution(grouped(rows)).rows == [
+        ("hopper-v4", "PPO (scalar)", "2", "2 ± 1", "2 [1, 3]", "–"),
+        ("hopper-v4", "DPPO (bellman)", "2", "10 ± 0", "10 [10, 10]", "+8 [+7, +9]"),
+        ("hopper-v4", "DPPO (kappa)", "2", "5 ± 0", "5 [5, 5]", "+3 [+2, +4]"),
+        ("hopper-v4 with noise", "DPPO (kappa+noise)", "1", "7 ± –", "7 [–]", "–"),
     ]
 
 
@@ -77,7 +94,7 @@ def test_every_block_of_a_document_is_replaced_and_the_rest_stays(grouped, tmp_p
         ("<!-- dgae report: returns -->\n<!-- dgae report: speed -->\n<!-- /dgae report -->",
          "a file with <!-- /dgae report --> after the table returns"),
         ("<!-- /dgae report -->\n", "a file without <!-- /dgae report --> where no table begins"),
-        ("<!-- dgae report: x -->\n<!-- /dgae report -->", "a file with tables named returns, reach, speed, not x"),
+        ("<!-- dgae report: x -->\n<!-- /dgae report -->", "a file with tables named returns, attribution, reach, speed, not x"),
     ],
 )  # fmt: skip
 def test_markers_that_do_not_match_are_refused(text, sentence, tmp_path):

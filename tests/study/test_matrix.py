@@ -5,8 +5,12 @@ import json
 import pytest
 
 import dgae_jax as dg
+from dgae_jax.cli import reproduce
+from dgae_jax.cli.arguments import parse_known
 from dgae_jax.configs.config import ConfigError, resolve
+from dgae_jax.configs.serial import to_dict
 from dgae_jax.study import matrix
+from dgae_jax.study.variants import VARIANTS
 
 
 def make(task, algo):
@@ -78,7 +82,7 @@ def test_a_directory_of_something_else_is_left_alone(tmp_path):
     ("change", "message"),
     [
         (lambda data: data | {"schema": 2}, "has schema 2, this version reads 1"),
-        (lambda data: data | {"cells": {"../../hopper": data["cells"]["hopper-ppo-0"]}}, "is named otherwise"),
+        (lambda data: data | {"cells": {"../../hopper": data["cells"]["hopper-ppo-0"]}}, "has no such name"),
         (lambda data: data | {"cells": [1]}, "must be a study that can be read"),
         (lambda data: {}, "must be a study that can be read"),
     ],
@@ -94,3 +98,31 @@ def test_a_study_that_cannot_be_understood_is_refused(tmp_path, change, message)
 def test_a_directory_without_a_study_is_none(tmp_path):
     with pytest.raises(ConfigError, match="must be the directory of a study"):
         matrix.read(tmp_path)
+
+
+def test_a_variant_takes_the_place_of_the_algorithm_in_the_name_of_a_cell():
+    (cell,) = matrix.matrix(["brax:ant"], ["kappa-0.1"], (3, 4), 2, lambda task, kind: resolve(dg.Config(env=task, algo="dppo")))
+    assert (cell.name, cell.kind) == ("brax_ant-kappa-0.1-3-4", "kappa-0.1")
+    assert [cell.kind for cell in cells((0,))] == ["ppo", "dppo", "ppo", "dppo"]
+
+
+def test_every_variant_of_a_question_is_a_configuration_of_its_own():
+    for question in VARIANTS:
+        arguments, rest = parse_known(reproduce.Arguments, "", ["study", "--variants", question, "--envs", "hopper", "--seeds", "0"])
+        found, _ = reproduce._cells(arguments, rest)
+        assert [cell.kind for cell in found] == list(VARIANTS[question])
+        assert len({json.dumps(to_dict(cell.config)) for cell in found}) == len(found)
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        ("--variants luck", "variants luck: must be one of attribution, attribution-noise, risk"),
+        ("--variants risk --algos ppo", "algos ppo: must be left out with --variants"),
+        ("--variants risk --config best.json", "config best.json: must be left out with --variants"),
+    ],
+)
+def test_variants_have_algorithms_of_their_own(words, message):
+    arguments, rest = parse_known(reproduce.Arguments, "", ["study", *words.split()])
+    with pytest.raises(ConfigError, match=message):
+        reproduce._cells(arguments, rest)

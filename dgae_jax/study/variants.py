@@ -1,0 +1,47 @@
+"""Questions for a study: tables of variants, each an algorithm and the flags in which it departs from its preset."""
+
+SCALAR = {
+    "scalar": "ppo",
+    "scalar-one-step": "ppo --critic.target bellman",
+    "huber": "dppo --critic.quantiles 1 --critic.target lambda-return",
+    "huber-one-step": "dppo --critic.quantiles 1 --critic.target bellman",
+}
+"""One value: half the squared error, or the Huber loss, which is what the quantile-Huber loss is for K = 1."""
+
+DISTRIBUTIONAL = {
+    "sr-lambda": "dppo",
+    "lambda-return": "dppo --critic.target lambda-return",
+    "lambda-shift": "dppo --critic.target lambda-shift",
+    "bellman": "dppo --critic.target bellman",
+    "bellman-frozen": "dppo --critic.target bellman-frozen",
+    "quantiles-1": "dppo --critic.quantiles 1",
+    "quantiles-8": "dppo --critic.quantiles 8",
+    "kappa-0.01": "dppo --critic.kappa 0.01",
+    "kappa-0.1": "dppo --critic.kappa 0.1",
+    "matched-scale": "dppo --critic.max-grad-norm 16",
+}
+"""A distribution. The loss of 64 quantiles is a sum with weights of ½ on average, 32 times the scalar one; Adam does not see the
+scale of a loss, but the bound of the gradient's norm, 0.5, does: 32 · 0.5 = 16 bounds both alike."""
+
+NOISE = "--noise.reward 0.5 --noise.action 0.1"
+"""Of rewards around 3 and actions within ±1."""
+
+
+def _noisy(variants: dict[str, str]) -> dict[str, str]:
+    return {f"{name}+noise": f"{words} {NOISE}" for name, words in variants.items()}
+
+
+def _preferences() -> dict[str, str]:
+    return {
+        f"{metric.replace(':', '-')}-lambda-{lam}+noise": f"dppo --metric {metric} --lam {lam} {NOISE}"
+        for metric in ("mean", "cvar:0.25")
+        for lam in (0.0, 0.5, 0.95, 1.0)
+    }
+
+
+VARIANTS: dict[str, dict[str, str]] = {
+    "attribution": {**SCALAR, **DISTRIBUTIONAL},
+    "attribution-noise": _noisy({**SCALAR, **DISTRIBUTIONAL}),
+    "risk": _preferences(),
+}
+"""What the gain of distributional critics is made of, with and without noise on the task; what a preference for safe returns buys."""
