@@ -35,7 +35,7 @@ from dgae_jax.cli.arguments import parse
 from dgae_jax.configs.build import make_task, make_trainer, seed_keys
 from dgae_jax.configs.config import Config, resolve
 from dgae_jax.learn import devices
-from dgae_jax.learn.iteration import _acting, _estimate, _roll_out, nothing
+from dgae_jax.learn.iteration import _estimate, _roll_out, acting, nothing
 from dgae_jax.learn.parallel import COMPILER_OPTIONS
 from dgae_jax.learn.types import Fitted
 from dgae_jax.physics.cores import cores
@@ -193,10 +193,10 @@ def _without_physics(config: Config) -> list[tuple[Callable, tuple]]:
     pieces = taken_apart(dataclasses.replace(config, physics="native"), 1)
     state, _ = pieces.rollout[1]
     actor, env = Fitted(state.policy.params, state.observations), make_task(config)
-    act = _acting(dg.make_algorithm(str(config.algo), env, config), actor)
+    act = acting(dg.make_algorithm(str(config.algo), env, config), actor)
     keys, obs = jax.random.split(jax.random.key(0), config.num_envs), state.episodes.env.obs
-    acting = lambda: jax.lax.scan(lambda c, _: (c, act(keys, obs)[0]), 0, None, length=config.horizon)[1]  # noqa: E731
-    return [(acting, ()), *pieces[1:]]
+    draw = lambda: jax.lax.scan(lambda c, _: (c, act(keys, obs)[0]), 0, None, length=config.horizon)[1]  # noqa: E731
+    return [(draw, ()), *pieces[1:]]
 
 
 @functools.cache

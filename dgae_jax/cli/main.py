@@ -8,6 +8,7 @@ from dgae_jax.run import terminal
 COMMANDS = {
     "train": "train a policy and write a run directory",
     "evaluate": "evaluate the policy of a run directory, or of a file",
+    "calibrate": "compare the critic of run directories with the returns that came",
     "reproduce": "train all of a study: tasks, algorithms and seeds",
     "report": "figures, tables and one page from the results of studies",
     "tune": "search for the settings with the highest return",

@@ -96,14 +96,14 @@ def _roll_out(
     """Every device rolls out its own worlds; what they saw is known to all."""
 
     def share(actor: Fitted, episodes: Episodes, keys: Key[Array, "T n"]) -> tuple[Episodes, Transition]:
-        return rollout(env, _acting(algorithm, actor), episodes, keys, episode_length=episode_length)
+        return rollout(env, acting(algorithm, actor), episodes, keys, episode_length=episode_length)
 
     actor = Fitted(state.policy.params, state.observations)
     episodes, step = devices.divided(share, (None, 0, 1), (0, 1))(actor, state.episodes, keys)
     return episodes, devices.gather(step)
 
 
-def _acting(algorithm: Algorithm, actor: Fitted) -> Act:
+def acting(algorithm: Algorithm, actor: Fitted) -> Act:
     """Actions drawn from the policy, and their log-probabilities."""
 
     def act(keys: Array, obs: Array) -> tuple[Array, Array]:

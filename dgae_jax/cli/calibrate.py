@@ -1,0 +1,98 @@
+"""Compare critics with the returns that came: dgae calibrate RUN_DIR …
+
+Flags are checked before the rest is imported: JAX, MuJoCo and Brax take seconds to load.
+"""
+
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import tyro
+
+from dgae_jax.cli.arguments import fail, parse
+from dgae_jax.configs.config import Config, ConfigError, invalid, resolve
+from dgae_jax.run import directory, files, terminal
+from dgae_jax.run.options import RunOptions
+
+
+@dataclass(frozen=True)
+class Arguments:
+    """Whose critics, and where the picture goes."""
+
+    run_dirs: tyro.conf.Positional[tuple[Path, ...]]
+    """Directories of runs [paths]."""
+    checkpoint: Literal["newest", "best"] = "newest"
+    """newest, or best: of the evaluations while it trained."""
+    index: int = 0
+    """Which of the seeds that were trained side by side, from 0."""
+    seed: int = 0
+    """Seed of the episodes [1]."""
+    out: Path | None = None
+    """PNG with a histogram per run; by default calibration.png in the directory of the first [path]."""
+    cache_dir: str = RunOptions.cache_dir
+    """Where compiled programs are kept between runs; none disables [path]."""
+
+
+def main() -> int:
+    """Write calibration.json into every run directory, and one picture; 0 done, 2 bad input, 130 stopped by SIGINT."""
+    terminal.prepare()
+    try:
+        arguments = parse(Arguments, "Compare the value distributions of critics with the returns that came.")
+        return _calibrate(arguments, _checked(arguments))
+    except ConfigError as mistake:
+        fail(mistake)
+    except KeyboardInterrupt:
+        terminal.warn("stopped by SIGINT")
+        return 130
+
+
+def _checked(arguments: Arguments) -> dict[Path, Config]:
+    """The runs; raises ConfigError for the first thing that is invalid."""
+    if not arguments.run_dirs:
+        raise ConfigError("RUN_DIRS: must be one run directory or more (--help lists every flag)")
+    runs = {path: resolve(directory.read_config(path)) for path in arguments.run_dirs}
+    for path, config in runs.items():
+        if config.critic.kind != "quantile":
+            raise ConfigError(f"{path}: must be a run with a value distribution, not {config.algo}")
+        if not 0 <= arguments.index < config.num_seeds:
+            raise invalid("index", arguments.index, f"a whole number from 0 to {config.num_seeds - 1}, the index of a seed in {path}")
+    if not 0 <= arguments.seed < 2**31:
+        raise invalid("seed", arguments.seed, f"a whole number from 0 to {2**31 - 1:,} (an int32)")
+    if arguments.out and not arguments.out.absolute().parent.is_dir():
+        raise invalid("out", arguments.out, "a file in a directory that exists")
+    return runs
+
+
+def _calibrate(arguments: Arguments, runs: dict[Path, Config]) -> int:
+    from dgae_jax.report import calibration as picture
+    from dgae_jax.run import calibration, curve, machine
+    from dgae_jax.run.progress import Reporter
+
+    machine.use_devices(next(iter(runs.values())), RunOptions(devices=1, num_processes=1))
+    machine.use_cache(arguments.cache_dir)
+    found, how = {}, {"which": arguments.checkpoint, "index": arguments.index, "seed": arguments.seed}
+    for path, config in runs.items():
+        with Reporter() as reporter:
+            result = calibration.calibrate(path, config, **how, watch=reporter.watch)
+        _write(path / "calibration.json", lambda to, result=result: files.write_json(to, result))
+        found[path.resolve().name] = str(config.algo), result
+        terminal.say(
+            f"{path.resolve().name}: {100 * result['coverage_90']:.0f} % of the returns in the central 90 %, "
+            f"{100 * result['crossing']:.0f} % of neighbours cross, rmse {result['rmse']:.3f}, spread {result['spread']:.3f}"
+        )
+    out = arguments.out or arguments.run_dirs[0] / "calibration.png"
+    _write(out, lambda to: curve.save(picture.histograms(found), to))
+    terminal.say(f"written {out}, and calibration.json beside each run")
+    return 0
+
+
+def _write(path: Path, write) -> None:
+    try:
+        write(path)
+    except OSError as reason:
+        raise ConfigError(f"{path}: must be a file that can be written ({reason.strerror})") from reason
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,65 @@
+"""Critics against the returns that came."""
+
+import dataclasses
+import json
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from dgae_jax.maths.transport import quantile_midpoints
+from dgae_jax.run import calibration, directory, loop
+from tests import helpers, runs
+
+UNIFORM = jnp.tile(quantile_midpoints(100), (1000, 1, 1))
+"""Of returns that are uniform on 0 … 1."""
+RETURNS = ((jnp.arange(1000) + 0.5) / 1000)[:, None]
+
+
+def test_a_critic_that_knows_the_distribution_is_calibrated():
+    found = calibration.statistics(UNIFORM, RETURNS)
+    assert found["coverage_90"] == pytest.approx(0.9, abs=0.002)
+    assert found["pit"] == pytest.approx([1 / calibration.BINS] * calibration.BINS, abs=0.011)
+    assert sum(found["pit"]) == pytest.approx(1)
+    # the mean is 1/2 and a uniform variable has standard deviation 1/√12
+    assert (found["crossing"], found["bias"]) == pytest.approx((0, 0), abs=1e-6)
+    assert (found["rmse"], found["spread"]) == pytest.approx((12**-0.5, 12**-0.5), abs=1e-4)
+
+
+def test_a_critic_half_as_wide_holds_half_of_the_returns_and_leaves_the_rest_at_both_ends():
+    found = calibration.statistics(0.25 + UNIFORM / 2, RETURNS)
+    assert found["coverage_90"] == pytest.approx(0.45, abs=0.002)
+    assert found["pit"][0] == pytest.approx(found["pit"][-1], abs=0.011)
+    assert found["pit"][0] + found["pit"][-1] == pytest.approx(0.55, abs=0.02)
+
+
+def test_neighbours_in_the_wrong_order_are_counted():
+    assert calibration.statistics(UNIFORM[..., ::-1], RETURNS)["crossing"] == 1
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"algo": "ppo"}, "must be a run with a value distribution, not ppo"),
+        ({"algo": "dppo", "gamma": 0.9999}, "gamma 0.9999: must be at most 0.99954, so that returns can be followed to their end"),
+    ],
+)
+def test_what_cannot_be_compared_is_refused_in_one_line(changes, message, tmp_path, monkeypatch, capsys):
+    gamma = changes.pop("gamma", 0.99)
+    directory.create(tmp_path / "run", dataclasses.replace(runs.small(**changes), gamma=gamma), runs.QUIET)
+    monkeypatch.setattr("sys.argv", ["dgae calibrate", str(tmp_path / "run")])
+    with pytest.raises(SystemExit, match="2"):
+        helpers.command("calibrate")()
+    assert message in capsys.readouterr().err
+
+
+@pytest.mark.slow  # a program of its own is compiled
+def test_the_command_writes_statistics_beside_every_run_and_a_picture(tmp_path, monkeypatch, capsys):
+    loop.start(runs.small("dppo"), dataclasses.replace(runs.QUIET, run_dir=tmp_path / "run"))
+    monkeypatch.setattr("sys.argv", ["dgae calibrate", str(tmp_path / "run"), "--cache-dir", runs.QUIET.cache_dir])
+    assert helpers.command("calibrate")() == 0
+    found = json.loads((tmp_path / "run" / "calibration.json").read_text())
+    assert found["samples"] == calibration.WORLDS * calibration.CHUNK  # episodes of 20 steps, in whole chunks
+    assert np.isfinite([*found["pit"], found["rmse"], found["crps"]]).all()
+    assert (tmp_path / "run" / "calibration.png").read_bytes().startswith(b"\x89PNG")
+    assert "of the returns in the central 90 %" in capsys.readouterr().out
