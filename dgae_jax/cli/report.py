@@ -14,6 +14,14 @@ from dgae_jax.cli.arguments import fail, parse
 from dgae_jax.configs.config import ConfigError, invalid
 from dgae_jax.run import terminal
 
+PURPOSE = "Figures, tables and one page of HTML from the results of studies."
+
+EXAMPLES = (
+    "dgae report studies/tuned",
+    "dgae report studies/tuned studies/wide --out comparison",
+    "dgae report studies/tuned --published --videos",
+)
+
 
 @dataclass(frozen=True)
 class Arguments:
@@ -36,7 +44,7 @@ def main() -> int:
     """Write a report; 0 done, 2 bad input, 130 stopped by SIGINT."""
     terminal.prepare()
     try:
-        return _report(parse(Arguments, "Figures, tables and one page of HTML from the results of studies."))
+        return _report(parse(Arguments, PURPOSE, examples=EXAMPLES))
     except ConfigError as mistake:
         fail(mistake)
     except KeyboardInterrupt:
