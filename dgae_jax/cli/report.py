@@ -32,7 +32,7 @@ class Arguments:
     out: Path | None = None
     """Directory to write to; by default report in the directory of the first study [path]."""
     published: bool = False
-    """Mark the results of docs/published.csv in the learning curves."""
+    """Mark results that others have published in the learning curves."""
     videos: bool = False
     """Film a typical run of each task for the page: of the best algorithm, the seed in the middle; they stay in STUDY/videos."""
     markdown: Path | None = None
