@@ -3,18 +3,22 @@
 import argparse
 import contextlib
 import io
+import os
 import re
-from collections.abc import Iterator, Sequence
-from typing import Any, NoReturn, TypeVar
+import sys
+import textwrap
+from collections.abc import Callable, Iterator, Sequence
+from typing import NoReturn, TypeVar
 
 import tyro
 
+from dgae_jax.cli import mistakes
+from dgae_jax.cli.flags import Leaf, built, leaves, view
+from dgae_jax.cli.spelling import refuse_foreign
 from dgae_jax.configs.config import ConfigError, flag
 from dgae_jax.run import terminal
 
 T = TypeVar("T")
-
-_FRAME = re.compile(r"[╭╮╰╯├┤│─+|\- ]*")  # tyro draws it in ASCII where the terminal has no more
 
 
 def fail(mistake: Exception | str) -> NoReturn:
@@ -35,33 +39,56 @@ def peek(argv: Sequence[str], *names: str) -> dict[str, str | None]:
     return vars(parser.parse_known_args(argv)[0])
 
 
-def parse(cls: type[T], description: str, argv: Sequence[str] | None = None, default: T | None = None) -> T:
-    """The dataclass `cls` filled from the command line, over `default`; `--help` explains every field."""
-    over: dict[str, Any] = {} if default is None else {"default": default}
-    with _mistakes_in_one_line():
-        return tyro.cli(cls, description=description, args=argv, **over)
+def parse(
+    cls: type[T], purpose: str, argv: Sequence[str] | None = None, default: T | None = None, examples: Sequence[str] = (), note: str = ""
+) -> T:
+    """The dataclass `cls` filled from the command line, over `default`.
+
+    `--help` says what the command is for, explains every field, and ends with the note and the examples.
+    """
+    argv, listed = sys.argv[1:] if argv is None else argv, list(leaves(cls, default))
+    _refuse_unknown(argv, listed)
+    with _understandable(listed, argv, examples, note):
+        return built(cls, tyro.cli(view(listed), description=purpose, args=argv))
 
 
-def parse_known(cls: type[T], description: str, argv: Sequence[str]) -> tuple[T, list[str]]:
-    """`parse` for a command line that says more: the dataclass, and the words that are not its own."""
-    with _mistakes_in_one_line():
-        return tyro.cli(cls, description=description, args=argv, return_unknown_args=True)
+def parse_known(
+    cls: type[T], purpose: str, argv: Sequence[str], examples: Sequence[str] = (), note: str = "", rest: Sequence[type] = ()
+) -> tuple[T, list[str]]:
+    """`parse` for a command line that says more: the dataclass, and the words that are of the dataclasses `rest`."""
+    ours = list(leaves(cls))
+    _refuse_unknown(argv, [*ours, *(leaf for other in rest for leaf in leaves(other))], refuse_foreign)
+    with _understandable(ours, argv, examples, note):
+        parsed, words = tyro.cli(view(ours), description=purpose, args=argv, return_unknown_args=True)
+    return built(cls, parsed), words
+
+
+def _refuse_unknown(argv: Sequence[str], listed: Sequence[Leaf], foreign: Callable[[str], None] = lambda _: None) -> None:
+    """Raise ConfigError for a flag that there is not; tyro's flags for completion know one command only, and may end in a stack trace."""
+    word = mistakes.unknown(argv, listed)
+    if word is None or {"-h", "--help"}.intersection(argv):
+        return
+    foreign(word)
+    raise ConfigError(f"{word}: is written dgae --completion SHELL" if word.startswith("--tyro") else mistakes.not_a_flag(word, listed))
 
 
 @contextlib.contextmanager
-def _mistakes_in_one_line() -> Iterator[None]:
+def _understandable(listed: Sequence[Leaf], argv: Sequence[str], examples: Sequence[str], note: str) -> Iterator[None]:
+    """The help with an ending, and a mistake in one line."""
+    tyro._experimental_options["ansi_codes"] = not os.environ.get("NO_COLOR")
     screen = io.StringIO()
     try:
         with contextlib.redirect_stderr(screen):
             yield
     except SystemExit as stop:
-        if stop.code in (0, None):
+        if stop.code in (0, None):  # the help was printed
+            terminal.say("\n".join(_ending(examples, note)))
             raise
-        fail(ConfigError(_one_line(screen.getvalue())))
+        fail(ConfigError(mistakes.sentence(screen.getvalue(), listed, argv)))
 
 
-def _one_line(box: str) -> str:
-    """The sentence inside tyro's framed message, without title, frame and pointer to the help text."""
-    lines = [line.strip().strip("│|").strip() for line in box.splitlines()[1:] if not _FRAME.fullmatch(line.strip())]
-    body = " ".join(line for line in lines if line).partition("For full helptext")[0]
-    return re.sub(r"\s+", " ", body).strip() + " (--help lists every flag)"
+def _ending(examples: Sequence[str], note: str) -> Iterator[str]:
+    if note:
+        yield "\n" + textwrap.fill(re.sub(r"\s+", " ", note), terminal.width())
+    if examples:
+        yield "\n".join(["", "examples:", *(f"  {line}" for line in examples)])

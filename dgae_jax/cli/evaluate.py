@@ -17,6 +17,14 @@ from dgae_jax.configs.config import ConfigError, invalid
 from dgae_jax.run import files, terminal
 from dgae_jax.run.options import WHOLE, RunOptions
 
+PURPOSE = "Evaluate the deterministic policy of a trained run."
+
+EXAMPLES = (
+    "dgae evaluate runs/walker --episodes 100",
+    "dgae evaluate runs/walker --checkpoint best --seed 7",
+    "dgae evaluate policies/hopper-dppo-1.msgpack --engine native --out hopper.json",
+)
+
 
 @dataclass(frozen=True)
 class Arguments:
@@ -44,7 +52,7 @@ def main() -> int:
     """Evaluate one run directory; 0 done, 2 bad input, 130 stopped by SIGINT."""
     terminal.prepare()
     try:
-        arguments = parse(Arguments, "Evaluate the deterministic policy of a trained run.")
+        arguments = parse(Arguments, PURPOSE, examples=EXAMPLES)
         _check(arguments)
         return _evaluate(arguments)
     except ConfigError as mistake:

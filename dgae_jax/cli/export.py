@@ -19,6 +19,14 @@ from dgae_jax.export import graph
 from dgae_jax.run import terminal
 from dgae_jax.run.options import RunOptions
 
+PURPOSE = "Take a trained policy and its critic out of a run, for programs without JAX."
+
+EXAMPLES = (
+    "dgae export runs/walker --to npz",
+    "dgae export runs/walker --to npz onnx gymnasium --checkpoint best",
+    "dgae export policies/hopper-dppo-1.msgpack --to onnx --out hopper",
+)
+
 
 @dataclass(frozen=True)
 class Arguments:
@@ -42,7 +50,7 @@ def main() -> int:
     """Export one policy; 0 done, 2 bad input, 130 stopped by SIGINT."""
     terminal.prepare()
     try:
-        arguments = parse(Arguments, "Take a trained policy and its critic out of a run, for programs without JAX.")
+        arguments = parse(Arguments, PURPOSE, examples=EXAMPLES)
         config, out = _checked(arguments)
         return _export(arguments, config, out)
     except ConfigError as mistake:

@@ -14,6 +14,14 @@ from dgae_jax.configs.config import ConfigError, invalid
 from dgae_jax.export import gl
 from dgae_jax.run import terminal
 
+PURPOSE = "Draw the figures of the paper that need no training."
+
+EXAMPLES = (
+    "dgae figures",
+    "dgae figures --only transport",
+    "dgae figures --only robots --out docs/images",
+)
+
 
 class Drawing(NamedTuple):
     """A figure: a module of the room `export` with a function `figure`."""
@@ -41,7 +49,7 @@ def main() -> int:
     """Draw the figures; 0 done, 2 bad input or no OpenGL, 130 stopped by SIGINT."""
     terminal.prepare()
     try:
-        arguments = parse(Arguments, "Draw the figures of the paper that need no training.")
+        arguments = parse(Arguments, PURPOSE, examples=EXAMPLES)
         chosen = {name: FIGURES[name] for name in ([arguments.only] if arguments.only else FIGURES)}
         if any(drawing.opengl for drawing in chosen.values()):
             gl.choose()

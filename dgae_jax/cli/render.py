@@ -18,6 +18,14 @@ from dgae_jax.export import gl, video
 from dgae_jax.run import directory, terminal
 from dgae_jax.run.options import RunOptions
 
+PURPOSE = "Make a film of the deterministic policy of a trained run, in Gymnasium."
+
+EXAMPLES = (
+    "dgae render runs/walker",
+    "dgae render runs/walker --compare runs/hopper --seconds 5 --format gif",
+    "dgae render runs/walker --during --out walker.mp4 --format mp4",
+)
+
 
 @dataclass(frozen=True)
 class Arguments:
@@ -72,7 +80,7 @@ def main() -> int:
     """Film one run or several; 0 done, 2 bad input or no OpenGL, 130 stopped by SIGINT."""
     terminal.prepare()
     try:
-        arguments = parse(Arguments, "Make a film of the deterministic policy of a trained run, in Gymnasium.")
+        arguments = parse(Arguments, PURPOSE, examples=EXAMPLES)
         _check(arguments)
         configs = [_config(path, arguments.index) for path in (arguments.run_dir, *arguments.compare)]
         _check_out(arguments)

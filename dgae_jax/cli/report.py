@@ -14,6 +14,14 @@ from dgae_jax.cli.arguments import fail, parse
 from dgae_jax.configs.config import ConfigError, invalid
 from dgae_jax.run import terminal
 
+PURPOSE = "Figures, tables and one page of HTML from the results of studies."
+
+EXAMPLES = (
+    "dgae report studies/tuned",
+    "dgae report studies/tuned studies/wide --out comparison",
+    "dgae report studies/tuned --published --videos",
+)
+
 
 @dataclass(frozen=True)
 class Arguments:
@@ -24,7 +32,7 @@ class Arguments:
     out: Path | None = None
     """Directory to write to; by default report in the directory of the first study [path]."""
     published: bool = False
-    """Mark the results of docs/published.csv in the learning curves."""
+    """Mark results that others have published in the learning curves."""
     videos: bool = False
     """Film a typical run of each task for the page: of the best algorithm, the seed in the middle; they stay in STUDY/videos."""
     markdown: Path | None = None
@@ -36,7 +44,7 @@ def main() -> int:
     """Write a report; 0 done, 2 bad input, 130 stopped by SIGINT."""
     terminal.prepare()
     try:
-        return _report(parse(Arguments, "Figures, tables and one page of HTML from the results of studies."))
+        return _report(parse(Arguments, PURPOSE, examples=EXAMPLES))
     except ConfigError as mistake:
         fail(mistake)
     except KeyboardInterrupt:

@@ -23,6 +23,16 @@ from dgae_jax.study import matrix
 from dgae_jax.study.launch import LaunchOptions, launcher
 from dgae_jax.study.variants import VARIANTS
 
+PURPOSE = "Train the cells of a study: tasks, algorithms and seeds."
+
+NOTE = "Every flag of dgae train may follow, and holds for all cells. The same command goes on where a study was stopped."
+
+EXAMPLES = (
+    "dgae reproduce studies/tuned --envs hopper walker2d --algos ppo dppo",
+    "dgae reproduce studies/paper --preset paper --scale 0.1 --physics native",
+    "dgae reproduce studies/wide --seeds 0 1 2 --policy.hidden 256 256",
+)
+
 
 @dataclass(frozen=True)
 class Arguments:
@@ -49,11 +59,15 @@ class Arguments:
     launch: Annotated[LaunchOptions, tyro.conf.arg(name="")] = field(default_factory=LaunchOptions)
 
 
+REST = (train.Arguments,)
+"""What every other flag is of."""
+
+
 def main() -> int:
     """Train what is not done; 0 all done, 1 some failed, 2 bad input, 130 / 143 / 129 stopped by a signal."""
     terminal.prepare()
     try:
-        arguments, rest = parse_known(Arguments, "Train the cells of a study; every flag of dgae train may follow.", sys.argv[1:])
+        arguments, rest = parse_known(Arguments, PURPOSE, sys.argv[1:], EXAMPLES, NOTE, REST)
         cells, options = _cells(arguments, rest)
         launch = launcher(arguments.launch)
         with matrix.opened(arguments.study, cells, shlex.join(["dgae", "reproduce", *sys.argv[1:]])) as study:

@@ -44,7 +44,7 @@ def understood(argv: Sequence[str]) -> list[str]:
     for word in argv:
         name, equals, value = word.partition("=")
         if name.startswith("--"):
-            _refuse_foreign(name)
+            refuse_foreign(name)
             words += [name, value] if equals else [name]
         else:
             words.append(word)
@@ -57,7 +57,9 @@ def understood(argv: Sequence[str]) -> list[str]:
     return out
 
 
-def _refuse_foreign(name: str) -> None:
+def refuse_foreign(name: str) -> None:
+    """Raise ConfigError for a flag of another trainer, with its name here."""
+    name = name.partition("=")[0]
     spelled = name[2:].replace("_", "-")
     part, dot, last = spelled.rpartition(".")
     ours = ELSEWHERE.get(last, last)

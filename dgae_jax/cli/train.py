@@ -18,6 +18,17 @@ from dgae_jax.configs.validation import validate
 from dgae_jax.run import directory, manifest, terminal
 from dgae_jax.run.options import RunOptions, validate_options
 
+PURPOSE = "Train a policy with PPO, TRPO, A2C or a distributional variant of them."
+
+NOTE = """The defaults are those of the preset for the task and the algorithm: dgae train --algo trpo --help shows TRPO's. A number may be
+written 1e6 or 1_000_000, and a task Hopper-v4."""
+
+EXAMPLES = (
+    "dgae train --env hopper --algo dppo --physics native --total-steps 2e5",
+    "dgae train --env Walker2d-v5 --algo ppo --run-dir runs/walker",
+    "dgae train --resume runs/walker",
+)
+
 
 @dataclass(frozen=True)
 class Arguments:
@@ -27,7 +38,7 @@ class Arguments:
     """Where all other settings start: tuned (ours) or paper (its set-up)."""
     config: Path | None = None
     """A config.json, of a run for example, where all other settings start instead [path]."""
-    settings: Annotated[Config, tyro.conf.arg(name="")] = field(default_factory=Config)
+    settings: Annotated[Config, tyro.conf.arg(name="")] = field(default_factory=lambda: resolve(Config()))
     run: Annotated[RunOptions, tyro.conf.arg(name="")] = field(default_factory=RunOptions)
 
 
@@ -56,8 +67,7 @@ def parsed(argv: list[str]) -> tuple[Config, RunOptions]:
     given = peek(argv, "preset", "config", "resume", "algo", "env", "policy.update", "critic.kind")
     config = _start(given)
     options = manifest.options(Path(given["resume"])) if given["resume"] else RunOptions()
-    description = "Train a policy on a MuJoCo task with PPO, TRPO, A2C or their distributional variants."
-    arguments = parse(Arguments, description, argv, default=Arguments(settings=config, run=options))
+    arguments = parse(Arguments, PURPOSE, argv, Arguments(settings=config, run=options), EXAMPLES, NOTE)
     validate_options(arguments.run)
     return validate(arguments.settings), arguments.run
 

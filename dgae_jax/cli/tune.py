@@ -18,8 +18,16 @@ from dgae_jax.study.search import USUAL, is_traced, space_of, values_of
 from dgae_jax.study.tune import tune
 from dgae_jax.study.tuning import Tuning
 
-DESCRIPTION = """Search for the settings with the highest return in Gymnasium, with Optuna. Every other flag is one of dgae train and
-holds for all trials. Run the same command again to go on, or several times at once to share the work."""
+PURPOSE = "Search for the settings with the highest return in Gymnasium, with Optuna."
+
+NOTE = """Every flag of dgae train may follow, and holds for all trials. Run the same command again to go on, or several times at once to
+share the work."""
+
+EXAMPLES = (
+    "dgae tune --env hopper --algo dppo --physics native",
+    "dgae tune --search gamma=0.95:0.999 policy.learning_rate=log:1e-4:1e-2",
+    "dgae tune --storage postgresql://USER:PASSWORD@HOST/NAME --trials 500",
+)
 
 
 @dataclass(frozen=True)
@@ -32,7 +40,7 @@ class Arguments:
     trials: int = 50
     """Trials to finish, by all processes together; the first one is the preset itself [trials]."""
     tuning_seeds: int = 2
-    """Seeds that each trial trains and is judged by: 1000, 1001, …, never the 0, 1, … of reports [seeds]."""
+    """Seeds that each trial trains and is judged by: 1000, 1001 and so on, never the 0, 1 and so on of reports [seeds]."""
     study: Path | None = None
     """Directory to write, or to go on in; by default tuning/ENV-ALGO. Its name is that of the study in the database [path]."""
     storage: str | None = None
@@ -63,6 +71,10 @@ LEFT_OUT = {
 """Flags of dgae train that a tuning sets itself."""
 
 
+REST = (train.Arguments,)
+"""What every other flag is of."""
+
+
 def main() -> int:
     """Tune; 0 done, 1 workers broke down, 2 bad input, 129 / 130 / 143 stopped by SIGHUP / SIGINT / SIGTERM."""
     terminal.prepare()
@@ -77,7 +89,7 @@ def main() -> int:
 
 def _tuning(argv: list[str]) -> Tuning:
     """What a command line means; raises ConfigError for the first argument that is invalid."""
-    arguments, rest = parse_known(Arguments, DESCRIPTION, argv)
+    arguments, rest = parse_known(Arguments, PURPOSE, argv, EXAMPLES, NOTE, REST)
     given = {word.partition("=")[0].replace("_", "-") for word in rest}
     for why, names in LEFT_OUT.items():
         for name in given.intersection(names):

@@ -136,7 +136,7 @@ class Config(_Settings):
     residual: str | None = None
     """One-step residual of the advantage: td (of means) or distributional (by the metric); unset: the algorithm's own."""
     metric: str = "mean"
-    """Preference over value distributions: mean (the paper's), cvar:α, wang:β, power:c or mean-cvar:α:weight."""
+    """Preference over value distributions: mean (the paper's), cvar:ALPHA, wang:BETA, power:C or mean-cvar:ALPHA:WEIGHT."""
     physics: str | None = None
     """Engine that simulates the task: jax (our own stages, CPU or GPU), mjx (MuJoCo MJX), mjx-warp (its Warp variant) or native
     (C MuJoCo, CPU); unset: jax, or mjx for one of Brax's own."""

@@ -1,4 +1,4 @@
-"""Results that others have published, from docs/published.csv of the repository."""
+"""Results that others have published, from published.csv beside this file."""
 
 import csv
 from pathlib import Path
@@ -8,6 +8,9 @@ from dgae_jax.configs.config import ConfigError
 
 DOCS = Path(__file__).parents[2] / "docs"
 """The documents of the repository; an installation without the repository has none."""
+
+FILE = Path(__file__).with_name("published.csv")
+"""The published results, with their sources."""
 
 
 class Published(NamedTuple):
@@ -22,13 +25,13 @@ class Published(NamedTuple):
     source: str
 
 
-def read(path: Path = DOCS / "published.csv") -> list[Published]:
+def read(path: Path = FILE) -> list[Published]:
     """All rows; raises ConfigError where there is no such file or a row is not understood."""
     try:
         with path.open(newline="") as file:
             return [_row(row) for row in csv.DictReader(file)]
     except OSError as reason:
-        raise ConfigError(f"published: needs docs/published.csv of the repository ({reason.strerror})", "published") from reason
+        raise ConfigError(f"published: needs {path} ({reason.strerror})", "published") from reason
     except (KeyError, ValueError, TypeError) as reason:
         raise ConfigError(f"{path}: must have the columns {', '.join(Published._fields)} with numbers in them ({reason})") from reason
 

@@ -46,7 +46,8 @@ class Reporter:
         """`speed` in samples of one run per second; returns may not exist yet."""
         left = (self.total - steps) / speed
         shown = "–" if mean_return is None else f"{mean_return:,.1f}"
-        text = f"{steps:,} of {self.total:,} steps  {speed * self.runs:,.0f} steps/s  return {shown}  {clock(left)} left"
+        done = f"{steps:,}/{self.total:,}" if self.bar else f"{steps:,} of {self.total:,} steps"  # 2,147,483,647 fit 80 columns
+        text = f"{done}  {speed * self.runs:,.0f} steps/s  return {shown}  {clock(left)} left"
         if self.bar:
             self.bar.update(self.task, completed=steps)
         (self.announce if steps >= self.total and not self.bar else self.watch)(text)

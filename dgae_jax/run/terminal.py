@@ -6,10 +6,13 @@ Everything a run says goes through here. It imports nothing of the package, so t
 import contextlib
 import io
 import os
+import shutil
 import sys
 from collections.abc import Iterator
 from contextvars import ContextVar
 from typing import Any, TextIO
+
+_DUMB = (None, "", "dumb", "unknown")
 
 _silent: ContextVar[bool] = ContextVar("silent", default=False)
 
@@ -55,11 +58,16 @@ def silenced(quiet: bool = True) -> Iterator[None]:
 
 
 def is_live() -> bool:
-    """Whether stdout is a terminal that someone may be looking at."""
+    """Whether stdout is a terminal that someone may be looking at, and on which a line can be written again."""
     try:
-        return sys.stdout is not None and sys.stdout.isatty() and not _silent.get()
+        return sys.stdout is not None and sys.stdout.isatty() and os.environ.get("TERM") not in _DUMB and not _silent.get()
     except ValueError:  # closed
         return False
+
+
+def width() -> int:
+    """Columns that a line may have."""
+    return shutil.get_terminal_size().columns
 
 
 def write(stream: TextIO | None, text: str) -> None:

@@ -128,9 +128,9 @@ def test_evaluating_twice_gives_the_same_returns(trained, run, tmp_path):
 @pytest.mark.parametrize(
     ("argv", "message"),
     [
-        (["--foo", "3"], r"Unrecognized options: --foo, 3"),
-        (["--policy.clp", "3"], r"Unrecognized options: --policy.clp, 3 Perhaps you meant: --policy.clip"),
-        (["--num-envs", "many"], r"--num-envs: invalid literal for int\(\) with base 10: 'many'"),
+        (["--foo", "3"], r"--foo: is not a flag of this command"),
+        (["--policy.clp", "3"], r"--policy.clp: is not a flag of this command; perhaps --policy.clip"),
+        (["--num-envs", "many"], r"--num-envs many: must be a whole number"),
         (["--num-envs"], r"--num-envs"),
         (["--policy.minibatches", "7"], r"--policy.minibatches 7: must be a divisor of num_envs \* horizon = 2,048"),
         (["--env", "hoper"], r"--env hoper: must be one of ant, hopper, swimmer, walker2d"),
@@ -209,7 +209,7 @@ def test_dgae_runs_a_command_by_name_and_names_them_all(monkeypatch, capsys):
         2,
         "error: --episodes 0: must be a whole number from 1 to 10,000 (they are played side by side)\n",
     )
-    assert dgae("trian") == (2, "", f"error: trian: must be one of {', '.join(COMMANDS)}\n")
+    assert dgae("trian") == (2, "", f"error: trian: must be one of {', '.join(COMMANDS)}; perhaps train\n")
     code, out, err = dgae("--help")
     assert (code, err) == (0, "")
     assert all(re.search(rf"^  {name} ", out, re.MULTILINE) for name in ("train", "evaluate", "render", "figures"))
@@ -269,8 +269,8 @@ def test_an_output_that_is_no_file_is_left_alone(trained, run, tmp_path):
     ("argv", "message"),
     [
         (["nowhere"], r"nowhere/config.json: must be a configuration that can be read \(No such file or directory\)"),
-        ([], r"RUN_DIR|PATH"),
-        ([".", "--engine", "ode"], r"'ode' for argument '--engine'"),
+        ([], r"RUN_DIR: must be given"),
+        ([".", "--engine", "ode"], r"--engine ode: must be one of .*gymnasium"),
         ([".", "--episodes", "0"], r"--episodes 0: must be a whole number from 1 to 10,000"),
     ],
 )
