@@ -15,6 +15,14 @@ from dgae_jax.configs.config import Config, ConfigError, invalid, resolve
 from dgae_jax.run import directory, files, terminal
 from dgae_jax.run.options import RunOptions
 
+PURPOSE = "Compare the value distributions of critics with the returns that came."
+
+EXAMPLES = (
+    "dgae calibrate runs/first",
+    "dgae calibrate runs/first --checkpoint best --seed 1",
+    "dgae calibrate runs/narrow runs/wide --out calibration.png",
+)
+
 
 @dataclass(frozen=True)
 class Arguments:
@@ -38,7 +46,7 @@ def main() -> int:
     """Write calibration.json into every run directory, and one picture; 0 done, 2 bad input, 130 stopped by SIGINT."""
     terminal.prepare()
     try:
-        arguments = parse(Arguments, "Compare the value distributions of critics with the returns that came.")
+        arguments = parse(Arguments, PURPOSE, examples=EXAMPLES)
         return _calibrate(arguments, _checked(arguments))
     except ConfigError as mistake:
         fail(mistake)

@@ -30,7 +30,7 @@ NOTE = "Every flag of dgae train may follow, and holds for all cells. The same c
 EXAMPLES = (
     "dgae reproduce studies/tuned --envs hopper walker2d --algos ppo dppo",
     "dgae reproduce studies/paper --preset paper --scale 0.1 --physics native",
-    "dgae reproduce studies/wide --seeds 0 1 2 --policy.hidden 256 256",
+    "dgae reproduce studies/why --variants attribution --envs hopper --scale 0.5",
 )
 
 

@@ -108,7 +108,7 @@ def test_a_variant_takes_the_place_of_the_algorithm_in_the_name_of_a_cell():
 
 def test_every_variant_of_a_question_is_a_configuration_of_its_own():
     for question in VARIANTS:
-        arguments, rest = parse_known(reproduce.Arguments, "", ["study", "--variants", question, "--envs", "hopper", "--seeds", "0"])
+        arguments, rest = parse_known(reproduce.Arguments, "", ["study", "--variants", question, "--envs", "hopper", "--seeds", "0"], rest=reproduce.REST)
         found, _ = reproduce._cells(arguments, rest)
         assert [cell.kind for cell in found] == list(VARIANTS[question])
         assert len({json.dumps(to_dict(cell.config)) for cell in found}) == len(found)
@@ -123,6 +123,6 @@ def test_every_variant_of_a_question_is_a_configuration_of_its_own():
     ],
 )
 def test_variants_have_algorithms_of_their_own(words, message):
-    arguments, rest = parse_known(reproduce.Arguments, "", ["study", *words.split()])
+    arguments, rest = parse_known(reproduce.Arguments, "", ["study", *words.split()], rest=reproduce.REST)
     with pytest.raises(ConfigError, match=message):
         reproduce._cells(arguments, rest)
