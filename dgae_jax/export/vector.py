@@ -10,6 +10,7 @@ from typing import Any
 
 import gymnasium
 import jax
+import jax.numpy as jnp
 import numpy as np
 from gymnasium.error import ClosedEnvironmentError, ResetNeeded
 from gymnasium.spaces import Box
@@ -80,7 +81,7 @@ class VectorTask(VectorEnv):
             self._worlds = blank(self.env, keys_of([0] * self.num_envs))
         given = mask & [s is not None for s in seeds]
         self._seeds = [s if new else old for s, old, new in zip(seeds, self._seeds, given, strict=True)]
-        keys = where(given, keys_of([s or 0 for s in seeds]), self._ready().keys)
+        keys = where(jnp.asarray(given), keys_of([s or 0 for s in seeds]), self._ready().keys)
         self._worlds = self._renew(self._ready()._replace(keys=keys), mask)
         return self._observations(), {}
 
