@@ -3,6 +3,7 @@ from .configs.config import ConfigError, NoiseConfig
 from .configs.presets import preset
 from .configs.pytree import Config, CriticConfig, PolicyConfig
 from .envs.registry import make_env
+from .export.vector import make_vector_env
 from .maths.returns import (
     bellman_target,
     dgae,
@@ -51,6 +52,7 @@ __all__ = [
     "make_algorithm",
     "make_env",
     "make_train",
+    "make_vector_env",
     "n_step_advantage",
     "pit",
     "preset",

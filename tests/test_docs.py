@@ -17,7 +17,11 @@ from tests.helpers import ROOT
 
 DOCUMENTS = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
 BLOCKS = [
-    pytest.param(block, id=f"{path.name}:{text[: text.index(block)].count(chr(10)) + 1}")
+    pytest.param(
+        block,
+        id=f"{path.name}:{text[: text.index(block)].count(chr(10)) + 1}",
+        marks=pytest.mark.slow if block.startswith("# takes minutes") else (),
+    )
     for path in DOCUMENTS
     for text in [path.read_text()]
     for block in re.findall(r"^```python\n(.*?)^```", text, re.MULTILINE | re.DOTALL)
@@ -26,6 +30,8 @@ BLOCKS = [
 
 @pytest.mark.parametrize("block", BLOCKS)
 def test_a_block_of_code_runs_as_it_is_printed(block, monkeypatch, tmp_path):
+    for package in re.findall(r"^# needs (\w+)$", block, re.MULTILINE):
+        pytest.importorskip(package)
     monkeypatch.chdir(tmp_path)
     tables = [(table, dict(table)) for table in (TABLE, UPDATES, METRICS)]
     try:

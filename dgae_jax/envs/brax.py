@@ -5,8 +5,12 @@ trainers: `brax.envs.get_environment("dgae_hopper", physics="jax")`.
 """
 
 import warnings
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from functools import partial
+from typing import Any
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
@@ -32,6 +36,24 @@ def make(name: str, physics: str, version: None, **parameters) -> Env:
             return BraxTask(brax.envs.get_environment(name, backend=physics, **parameters))
     except (ValueError, TypeError) as reason:
         raise ValueError(f"environment {BRAX}{name}: must be one that Brax can build on {physics} ({reason})") from None
+
+
+@contextmanager
+def trainers() -> Iterator[None]:
+    """Brax's trainers (`brax.training.agents`) can be called inside.
+
+    They call `jax.device_put_replicated`, which JAX does not have from 0.10 on (google/brax#671); here it has it again.
+    """
+    jax.device_put_replicated = _replicated
+    try:
+        yield
+    finally:
+        del jax.device_put_replicated
+
+
+def _replicated(tree: Any, devices: Sequence[Any]) -> Any:
+    """A copy for each device along a new first axis, which `jax.pmap` divides."""
+    return jax.tree.map(lambda x: jnp.stack([x] * len(devices)), tree)
 
 
 for _name in TASKS:

@@ -40,7 +40,8 @@ def start(env: Env, keys: Key[Array, " N"]) -> Episodes:
     return Episodes(state, none, zero, never, never, none, nothing)
 
 
-def _where(mask: Bool[Array, " N"], yes: Any, no: Any) -> Any:
+def where(mask: Bool[Array, " N"], yes: Any, no: Any) -> Any:
+    """World by world, one of two trees whose arrays begin with the axis of worlds."""
     return jax.tree.map(lambda a, b: jnp.where(_like(mask, b), a, b), yes, no)
 
 
@@ -48,7 +49,7 @@ def _like(mask: Bool[Array, " N"], x: Array) -> Array:
     return mask.reshape(mask.shape + (1,) * (x.ndim - 1))
 
 
-def _finite(tree: Any) -> Bool[Array, " N"]:
+def finite(tree: Any) -> Bool[Array, " N"]:
     """Which worlds have only finite numbers."""
     leaves = [x for x in jax.tree.leaves(tree) if jnp.issubdtype(x.dtype, jnp.floating)]
     return jnp.stack([jnp.isfinite(x).reshape(x.shape[0], -1).all(1) for x in leaves]).all(0)
@@ -64,14 +65,14 @@ def _quarantine(step: Transition, valid: Bool[Array, " N"]) -> Transition:
 
 def _record(episodes: Episodes, attempt: Any, valid: Bool[Array, " N"]) -> Episodes:
     """Count the invalid steps, and keep the state before and the action of each world's last."""
-    return episodes._replace(nonfinite=episodes.nonfinite + ~valid, incident=_where(valid, episodes.incident, attempt))
+    return episodes._replace(nonfinite=episodes.nonfinite + ~valid, incident=where(valid, episodes.incident, attempt))
 
 
 def _advance(episodes: Episodes, after: Any, step: Transition, fresh: Episodes) -> Episodes:
     """The worlds after a step: those whose episode ended begin a fresh one."""
     done = step.terminated | step.truncated
     steps, total = episodes.steps + 1, episodes.total + step.reward
-    state, now_steps, now_total = _where(done, (fresh.env, fresh.steps, fresh.total), (after, steps, total))
+    state, now_steps, now_total = where(done, (fresh.env, fresh.steps, fresh.total), (after, steps, total))
     return episodes._replace(
         env=state,
         steps=now_steps,
@@ -96,7 +97,7 @@ def rollout(env: Env, act: Act, episodes: Episodes, keys: Key[Array, "T N"], *, 
         before = episodes.env
         action, log_prob = act(act_keys, before.obs)
         after = jax.vmap(env.step)(before, jnp.clip(action, low, high))
-        valid = _finite((before.obs, action, log_prob, after.pipeline_state, after.reward, after.obs, after.done))
+        valid = finite((before.obs, action, log_prob, after.pipeline_state, after.reward, after.obs, after.done))
         terminated = (after.done > 0) | ~valid
         truncated = ~terminated & (episodes.steps + 1 >= episode_length)
         step = Transition(before.obs, action, log_prob, after.reward, terminated, truncated, after.obs, valid)  # pyright: ignore[reportArgumentType]
