@@ -11,6 +11,7 @@ import contextlib
 import dataclasses
 import itertools
 import json
+import re
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -74,7 +75,7 @@ def _groups(seeds: Sequence[int], per_run: int) -> Iterator[Sequence[int]]:
 
 def _cell(config: Config) -> Cell:
     last = f"-{config.seed + config.num_seeds - 1}" if config.num_seeds > 1 else ""
-    return Cell(f"{config.env.replace(':', '_')}-{config.algo}-{config.seed}{last}", config)
+    return Cell(f"{re.sub('[:/]', '_', config.env)}-{config.algo}-{config.seed}{last}", config)
 
 
 @contextlib.contextmanager
