@@ -19,6 +19,11 @@ class Given(Wrapper):
         return low, high
 
 
+def with_range(env: Env) -> Env:
+    """The environment, with a range of its actions if it has none."""
+    return env if hasattr(env, "action_range") else Given(env)
+
+
 def make(name: str, physics: str, version: None) -> Env:
     """The object that was given under `name`; raises ValueError, with the reason, for one that the trainer cannot take."""
     env = GIVEN[CUSTOM + name]

@@ -73,7 +73,7 @@ class _Worlds:
         seeds, needed = _numbers(before[0]), before[1].reshape(-1)
         obs = after[0].reshape(len(seeds), -1)
         obs[:] = 0
-        for i in np.flatnonzero(needed):
+        for i in np.flatnonzero(needed).tolist():
             obs[i] = self._begin(i, seeds[i])
 
     def step(self, before: Sequence[np.ndarray], after: Sequence[np.ndarray]) -> None:

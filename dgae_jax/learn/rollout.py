@@ -99,9 +99,9 @@ def rollout(env: Env, act: Act, episodes: Episodes, keys: Key[Array, "T N"], *, 
     """T steps in every world, each with a key of its own, so that it does not matter how worlds are divided over devices.
 
     The action is clipped to the actuators' range before it acts, not in the record. The time limit is `episode_length`, or the
-    task's own if that comes first. An episode that ends is followed by a fresh random one; `next_obs` stays the observation in which it ended. A world whose action, state, reward or observation turns
-    non-finite is quarantined: its episode ends there as terminated with reward 0, the step is marked as not `valid`, and only
-    finite numbers leave this function.
+    task's own if that comes first. An episode that ends is followed by a fresh random one; `next_obs` stays the observation in which
+    it ended. A world whose action, state, reward or observation turns non-finite is quarantined: its episode ends there as terminated
+    with reward 0, the step is marked as not `valid`, and only finite numbers leave this function.
     """
     low, high = env.action_range
 

@@ -71,10 +71,10 @@ def train(config: Config, run_dir: str | Path | None = None, *, env: Env | None 
     """Train, evaluate and return the whole of a run, as the command line does.
 
     `env` is an environment of one's own, which takes the place of the task that `config` names; the run is recorded as one of
-    `custom:` and the name of its class. Without `run_dir` it is written to a temporary directory and removed at the end. `options` are fields of `RunOptions`
-    (`episodes=5`, `checkpoint_every=50_000`, `resume_or_start=True`, …); `quiet` prints nothing but warnings. Raises
-    ConfigError for an invalid setting before anything is written, and RunError if the run ends early, by a signal too: its
-    message says how to go on, from a directory that stays, even a temporary one.
+    `custom:` and the name of its class. Without `run_dir` it is written to a temporary directory and removed at the end. `options`
+    are fields of `RunOptions` (`episodes=5`, `checkpoint_every=50_000`, `resume_or_start=True`, …); `quiet` prints nothing but
+    warnings. Raises ConfigError for an invalid setting before anything is written, and RunError if the run ends early, by a signal
+    too: its message says how to go on, from a directory that stays, even a temporary one.
     """
     names = [f.name for f in dataclasses.fields(RunOptions) if f.name not in ("run_dir", "resume")]
     for name in options:
@@ -90,8 +90,9 @@ def train(config: Config, run_dir: str | Path | None = None, *, env: Env | None 
 def load_policy(run_dir: str | Path, which: str = "newest", *, seed: int = 0, env: Env | None = None) -> Policy:
     """The policy of a run's newest checkpoint, or of its best evaluation's (`which="best"`); `run_dir` may be a policy's file.
 
-    `seed` is the index among the seeds trained side by side (`num_seeds`), `env` the object that `train` was given. Only networks and observation statistics are read.
-    Raises ConfigError for an invalid argument or a directory that holds no run, CheckpointError if no checkpoint can be read.
+    `seed` is the index among the seeds trained side by side (`num_seeds`), `env` the object that `train` was given. Only networks and
+    observation statistics are read. Raises ConfigError for an invalid argument or a directory that holds no run, CheckpointError if
+    no checkpoint can be read.
     """
     with given(env) as name:
         config = resolve(restore.config_of(Path(run_dir)))

@@ -128,7 +128,9 @@ class _Progress(NamedTuple):
 
 @lru_cache(maxsize=1)
 def _programs(config: Config, given: Any) -> tuple[Trainer, Callable[[Fitted, play.Play, int], play.Play]]:
-    """In the physics of `config`, and of the object that its name stands for now: the trainer, and `go_on(policy, episodes, until) -> episodes`."""
+    """In the physics of `config`, for the object that its task's name stands for now, if it does for one: the trainer, and
+    `go_on(policy, episodes, until) -> episodes`.
+    """
     env = make_task(config)
     greedy = make_greedy(env, config)
     return make_trainer(env, 1), jax.jit(lambda policy, now, until: play.play(env, lambda obs: greedy(policy, obs), now, until))

@@ -16,7 +16,7 @@ from dgae_jax.run import checkpoint, compiling, directory, hosts, machine, manif
 from dgae_jax.run.evaluations import EvaluationsFile
 from dgae_jax.run.options import RunOptions, validate_options
 from dgae_jax.run.summary import describe
-from dgae_jax.run.training import Heed, RunError, run_to_end, unheeded
+from dgae_jax.run.training import Heed, RunError, TaskFailedError, run_to_end, unheeded
 
 
 class Finished(NamedTuple):
@@ -78,13 +78,13 @@ def resume_or_start(config: Config, options: RunOptions) -> int:
 
 
 def _exit_code(work: Callable[[Config, RunOptions], Finished], config: Config, options: RunOptions) -> int:
-    """Say how it went. Where XLA is left compiling the process ends here, since Python would wait for it."""
+    """Say how it went. The process ends here where Python would wait for XLA, or JAX say a task's failure again, with its own stack."""
     try:
         finished = work(config, options)
     except RunError as end:
         if hosts.is_first():
             (terminal.say if end.exit_code > 128 else terminal.warn)(str(end))
-        if compiling.is_running():
+        if compiling.is_running() or isinstance(end, TaskFailedError):
             os._exit(end.exit_code)
         return end.exit_code
     with terminal.silenced(not hosts.is_first()):

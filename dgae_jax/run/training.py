@@ -42,6 +42,10 @@ class BrokeDownError(RunError):
     """A run whose updates or worlds are not finite any more: its settings are to blame, not the machine."""
 
 
+class TaskFailedError(RunError):
+    """A run whose task raised an exception in the middle of a program."""
+
+
 Heed = Callable[[int, dict[str, Any]], None]
 """Told samples per run and result of every evaluation on the way, when its checkpoint is on its way to the disk. What it raises
 ends the run, which can be resumed."""
@@ -78,7 +82,7 @@ def run_to_end(config: Config, options: RunOptions, run_dir: Path, state: TrainS
             if _is_out_of_memory(reason):
                 raise RunError(1, f"stopped: out of memory ({why}); {_left(run_dir)}") from reason
             if task_spec(config).on_host:
-                raise RunError(1, f"stopped: {config.env} failed ({why}); {_left(run_dir)}") from reason
+                raise TaskFailedError(1, f"stopped: {config.env} failed ({why}); {_left(run_dir)}") from reason
             raise
     return result
 
