@@ -70,7 +70,7 @@ def _checked(arguments: Arguments) -> tuple[Config, Path]:
     if not 0 <= arguments.index < config.num_seeds:
         allowed = f"a whole number from 0 to {config.num_seeds - 1}, the index of a seed in {arguments.run_dir}"
         raise invalid("index", arguments.index, allowed)
-    if "gymnasium" in arguments.to and not spec_of(config.env).referees:
+    if "gymnasium" in arguments.to and spec_of(config.env).referee() is None:
         raise invalid("to", "gymnasium", f"left out with {config.env}, which Gymnasium does not play")
     out = arguments.out or _default_out(arguments.run_dir)
     if not _can_be_written(out):

@@ -123,7 +123,7 @@ def _config(path: Path, index: int) -> Config:
     """The configuration of a run that Gymnasium can play."""
     config = resolve(directory.read_config(path))
     if not spec_of(config.env).referees:
-        raise ConfigError(f"{path}: must be a run of {', '.join(TASKS)}, which Gymnasium plays; it is one of {config.env}")
+        raise ConfigError(f"{path}: must be a run of {', '.join(TASKS)}, which can be filmed; it is one of {config.env}")
     if index >= config.num_seeds:
         raise invalid("index", index, f"below {config.num_seeds}, the number of seeds in {path}")
     return config

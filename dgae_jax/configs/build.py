@@ -13,6 +13,7 @@ from dgae_jax.configs.config import Config, ConfigError, CriticConfig, PolicyCon
 from dgae_jax.configs.parts import COVARIANCES, CRITICS, DESCENT, OPTIMIZERS, RESIDUALS, TARGETS, UPDATES
 from dgae_jax.configs.validation import validate
 from dgae_jax.envs.base import Env
+from dgae_jax.envs.given import with_range
 from dgae_jax.envs.noise import Noisy
 from dgae_jax.envs.registry import make_env
 from dgae_jax.learn import diagnostics, iteration, parallel
@@ -74,12 +75,12 @@ def make_train(
 ) -> tuple[Callable[[jax.Array], TrainState], Callable[[TrainState], tuple[TrainState, iteration.Metrics]]]:
     """`init(key) -> state` and `train_step(state) -> (state, metrics)`: see `iteration.make_train`.
 
-    Raises ConfigError for an invalid configuration.
+    Actions of an environment without an `action_range` lie in [−1, 1]. Raises ConfigError for an invalid configuration.
     """
     config = validate(config)
     return iteration.make_train(
         algorithm,
-        env,
+        with_range(env),
         num_envs=config.num_envs,
         horizon=config.horizon,
         episode_length=config.episode_length,

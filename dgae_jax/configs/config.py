@@ -127,10 +127,11 @@ class Config(_Settings):
     """One training run."""
 
     env: str = "hopper"
-    """Task: ant, hopper, swimmer, walker2d, or brax:NAME for one of Brax's own."""
+    """Task: ant, hopper, swimmer, walker2d, or one of somebody else's: brax:NAME, playground:NAME (MuJoCo Playground) or gymnasium:ID
+    (continuous, on a CPU)."""
     env_version: str | None = None
     """Gymnasium version whose semantics the task has: v4 (Gym's v3, but for Ant's contact forces and their cost) or v5; unset: v4, or
-    none for one of Brax's own."""
+    none for a task of somebody else's."""
     algo: str | None = None
     """Algorithm: ppo, trpo, a2c, or with a value distribution dppo, dtrpo, da2c; unset: dppo."""
     residual: str | None = None
@@ -139,7 +140,7 @@ class Config(_Settings):
     """Preference over value distributions: mean (the paper's), cvar:ALPHA, wang:BETA, power:C or mean-cvar:ALPHA:WEIGHT."""
     physics: str | None = None
     """Engine that simulates the task: jax (our own stages, CPU or GPU), mjx (MuJoCo MJX), mjx-warp (its Warp variant) or native
-    (C MuJoCo, CPU); unset: jax, or mjx for one of Brax's own."""
+    (C MuJoCo, CPU); unset: jax, or mjx for brax:NAME and playground:NAME; gymnasium:ID has gymnasium only."""
     seed: int = 0
     """Seed of the first run; the others follow by one [1]."""
     num_seeds: int = 1

@@ -11,7 +11,7 @@ from dgae_jax.configs.config import Config, ConfigError, invalid, lookup, resolv
 from dgae_jax.configs.parts import COVARIANCES, CRITICS, OPTIMIZERS, RESIDUALS, TARGETS, UPDATES
 from dgae_jax.configs.serial import check_types
 from dgae_jax.maths.risk import check_metric
-from dgae_jax.physics.registry import require
+from dgae_jax.physics.registry import ENGINES, require
 
 LARGEST = 2**31 - 1
 """What an int32, the largest index and counter of a device, can hold."""
@@ -83,7 +83,8 @@ def _check_task(config: Config) -> None:
     spec = task_spec(config)
     lookup("physics", config.physics, dict.fromkeys(spec.engines))
     try:
-        require(str(config.physics))
+        if config.physics in ENGINES:
+            require(str(config.physics))
     except ValueError as reason:
         raise ConfigError(str(reason), "physics") from None
     if spec.versions:

@@ -5,5 +5,16 @@ engine of that name, where it cannot print that Warp is not installed.
 import dgae_jax.physics.mjx  # noqa: F401, I001
 import brax.envs
 from brax.envs.base import Env, State, Wrapper
+from jaxtyping import Array
 
-__all__ = ["Env", "State", "Wrapper", "brax"]
+__all__ = ["Env", "State", "Wrapper", "brax", "restart"]
+
+
+def restart(env: Env, state: State, rng: Array, done: Array) -> State:
+    """A fresh episode for a world that is in `state`, looked at only where that one is `done`.
+
+    It is `env.reset(rng)`, computed in every world at every step, unless the class of `env` has a method
+    `restart(state, rng, done)` of its own, which may return anything of that shape for a world that is not done.
+    """
+    own = getattr(type(env), "restart", None)  # a wrapper passes on what its environment has, which is not its own
+    return env.reset(rng) if own is None else own(env, state, rng, done)

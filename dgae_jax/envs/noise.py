@@ -1,11 +1,12 @@
 """Randomness for tasks that have none: deterministic MuJoCo leaves a value distribution little to model."""
 
+from collections.abc import Callable
 from typing import Any
 
 import jax
 from jaxtyping import Array
 
-from dgae_jax.envs.base import Env, State, Wrapper
+from dgae_jax.envs.base import Env, State, Wrapper, restart
 from dgae_jax.envs.task import Task
 
 
@@ -29,8 +30,15 @@ class Noisy(Wrapper):
 
     def reset(self, rng: Array) -> State:
         """The task's own start, moved and seen with noise."""
+        return self._begin(rng, self.env.reset)
+
+    def restart(self, state: State, rng: Array, done: Array) -> State:
+        """The same as `envs.base.restart` has it."""
+        return self._begin(rng, lambda key: restart(self.env, state, key, done))
+
+    def _begin(self, rng: Array, reset: Callable[[Array], State]) -> State:
         key, q_key, v_key, o_key, r_key = jax.random.split(rng, 5)
-        state = self.env.reset(r_key)
+        state = reset(r_key)
         if self._initial:
             physics: Any = state.pipeline_state
             moved = (x + self._initial * jax.random.normal(k, x.shape) for k, x in ((q_key, physics.qpos), (v_key, physics.qvel)))

@@ -4,7 +4,9 @@ Importing this loads no task, so that names can be checked before JAX, MuJoCo an
 """
 
 import sys
-from collections.abc import Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from importlib.util import find_spec
 from pkgutil import resolve_name
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -15,6 +17,12 @@ if TYPE_CHECKING:
 
 BRAX = "brax:"
 """Before the name of an environment of Brax's own."""
+PLAYGROUND = "playground:"
+"""Before the name of a task of MuJoCo Playground."""
+GYMNASIUM = "gymnasium:"
+"""Before the id of a task of Gymnasium."""
+CUSTOM = "custom:"
+"""Before the name of the class of an environment that is given as an object."""
 
 BRAX_NAMES = (
     "ant", "fast", "halfcheetah", "hopper", "humanoid", "humanoidstandup", "inverted_pendulum", "inverted_double_pendulum",
@@ -34,6 +42,10 @@ class EnvSpec(NamedTuple):
     referees: Mapping[str, str]
     """Gymnasium's id for each version, the first of them the default. Empty for a task without versions, which is evaluated in
     its own engine."""
+    gymnasium_id: str | None = None
+    """Gymnasium's id of a task that is one of Gymnasium's and has no versions here."""
+    on_host: bool = False
+    """Whether its worlds are Python objects on the host: for a CPU, a single device, and no exact resume."""
 
     @property
     def default_engine(self) -> str:
@@ -52,7 +64,7 @@ class EnvSpec(NamedTuple):
 
     def referee(self, version: str | None = None) -> str | None:
         """Gymnasium's id of the task that evaluates policies; None: the task itself, in its own engine."""
-        return self.referees[version or self.versions[0]] if self.referees else None
+        return self.referees[version or self.versions[0]] if self.referees else self.gymnasium_id
 
     def choose(self, physics: str | None = None, version: str | None = None) -> tuple[str, str | None]:
         """Engine and version, with the defaults filled in; raises ValueError, naming what is allowed."""
@@ -72,13 +84,10 @@ def _ours(name: str) -> EnvSpec:
 TASKS = {name.lower(): _ours(name) for name in ("Ant", "Hopper", "Swimmer", "Walker2d")}
 
 
-def spec_of(name: str) -> EnvSpec:
-    """What exists of the task `name`; raises ValueError with "one of …" for an unknown one."""
-    if name in TASKS:
-        return TASKS[name]
-    if name.startswith(BRAX) and name.removeprefix(BRAX) in _brax_names():
-        return EnvSpec("dgae_jax.envs.brax:make", (name.removeprefix(BRAX),), ("mjx",), {})
-    raise ValueError(f"one of {', '.join(TASKS)}, or {BRAX}NAME with NAME one of {', '.join(_brax_names())}")
+def _brax(name: str) -> EnvSpec:
+    if name not in _brax_names():
+        raise ValueError(f"{BRAX}NAME with NAME one of {', '.join(_brax_names())}")
+    return EnvSpec("dgae_jax.envs.brax:make", (name,), ("mjx",), {})
 
 
 def _brax_names() -> list[str]:
@@ -88,12 +97,65 @@ def _brax_names() -> list[str]:
     return sorted({*BRAX_NAMES, *registered})
 
 
+def _playground(name: str) -> EnvSpec:
+    if find_spec("mujoco_playground") is None:
+        raise ValueError('used with the package playground, which is not installed: pip install "dgae_jax[playground]"')
+    return EnvSpec("dgae_jax.envs.playground:make", (name,), ("mjx", "mjx-warp"), {})
+
+
+def _gymnasium(name: str) -> EnvSpec:
+    return EnvSpec("dgae_jax.envs.gymnasium:make", (name,), ("gymnasium",), {}, gymnasium_id=name, on_host=True)
+
+
+GIVEN: dict[str, Any] = {}
+"""Environments that were given as objects, by their names with the prefix."""
+
+
+@contextmanager
+def given(env: Any) -> Iterator[str | None]:
+    """Let the object `env` be a task while the context lasts, by the name of its class, which is yielded; None does nothing."""
+    if env is None:
+        yield None
+        return
+    name = CUSTOM + type(getattr(env, "unwrapped", env)).__name__
+    before, GIVEN[name] = GIVEN.get(name), env
+    try:
+        yield name
+    finally:
+        del GIVEN[name]
+        if before is not None:
+            GIVEN[name] = before
+
+
+def _custom(name: str) -> EnvSpec:
+    if CUSTOM + name not in GIVEN:
+        raise ValueError("given as an object from Python: dgae_jax.train(config, run_dir, env=…), load_policy(run_dir, env=…)")
+    return EnvSpec("dgae_jax.envs.given:make", (name,), ("custom",), {})
+
+
+PREFIXES: dict[str, Callable[[str], EnvSpec]] = {BRAX: _brax, PLAYGROUND: _playground, GYMNASIUM: _gymnasium, CUSTOM: _custom}
+"""Whose tasks a name means, and what exists of the one whose name follows; raises ValueError, naming what is allowed."""
+
+NAMES = f"one of {', '.join(TASKS)}, or {BRAX}NAME, {PLAYGROUND}NAME or {GYMNASIUM}ID for a task of somebody else's"
+"""What a task's name must be."""
+
+
+def spec_of(name: str) -> EnvSpec:
+    """What exists of the task `name`; raises ValueError with "one of …" for an unknown one."""
+    if name in TASKS:
+        return TASKS[name]
+    for prefix, of_others in PREFIXES.items():
+        if name.startswith(prefix) and name != prefix:
+            return of_others(name.removeprefix(prefix))
+    raise ValueError(NAMES)
+
+
 def make_env(name: str, *, physics: str | None = None, version: str | None = None, **task_parameters) -> "Env":
     """The task `name` over the engine `physics`, with Gymnasium's semantics of `version`: by default `jax` and `v4`.
 
-    `task_parameters` are those of Gymnasium's constructor. `brax:NAME` is an environment of Brax's own, on `mjx`; its
-    parameters are those of Brax's constructor. Raises ValueError, naming what is allowed, for an unknown name, an engine
-    that the task does not run on or that is not installed, and a version that it does not have.
+    `task_parameters` are those of Gymnasium's constructor. Tasks of others are `brax:NAME` on `mjx`, `playground:NAME` on `mjx` or
+    `mjx-warp`, and `gymnasium:ID`; their parameters are those of their own constructors. Raises ValueError, naming what is allowed,
+    for an unknown name, an engine that the task does not run on or that is not installed, and a version that it does not have.
     """
     try:
         spec = spec_of(name)

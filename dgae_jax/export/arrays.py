@@ -16,7 +16,7 @@ from dgae_jax.configs.config import Config, ConfigError
 from dgae_jax.export.outside import policy as outside
 from dgae_jax.learn.normalizers import OBSERVATION_LIMIT
 from dgae_jax.run.api import Policy
-from dgae_jax.run.evaluation import referee
+from dgae_jax.run.evaluation import referee, time_limit
 from dgae_jax.run.restore import Trained
 
 Arrays = dict[str, np.ndarray]
@@ -43,7 +43,7 @@ def arrays_of(found: Trained, config: Config, index: int) -> Arrays:
         "action_low": np.asarray(low, np.float32),
         "action_high": np.asarray(high, np.float32),
         "env": np.array(referee(config)),
-        "episode_length": np.array(config.episode_length),
+        "episode_length": np.array(time_limit(config)),
     }
     _compare(arrays, Policy(policy, critic, config), found)
     return arrays

@@ -57,7 +57,7 @@ def card(kind: str, arrays: Mapping[str, np.ndarray], config: Config, index: int
     task, engine = referee(config), engines_of(config)[0]
     chosen = ", episodes which chose this checkpoint" if which == "best" else ""
     rows = {
-        "task": f"{task}, episodes of at most {config.episode_length:,} steps, observations [{sizes['observations']}], "
+        "task": f"{task}, episodes of at most {int(arrays['episode_length']):,} steps, observations [{sizes['observations']}], "
         f"actions [{sizes['actions']}]",
         "algorithm": str(config.algo),
         "trained on": f"{config.task}, engine {config.physics}, seed {config.seed + index}",

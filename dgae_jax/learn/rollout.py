@@ -1,13 +1,14 @@
 """Episodes in parallel worlds: time limits, true successors, fresh resets; for training and for evaluation."""
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, Key
 
-from dgae_jax.envs.base import Env
+from dgae_jax.envs.base import Env, restart
 from dgae_jax.learn.types import Transition
 
 Act = Callable[[Array, Array], tuple[Array, Array]]
@@ -33,7 +34,11 @@ class Episodes(NamedTuple):
 
 def start(env: Env, keys: Key[Array, " N"]) -> Episodes:
     """A world per key, at the beginning of an episode each."""
-    state, count = jax.vmap(env.reset)(keys), len(keys)
+    return _begun(env, jax.vmap(env.reset)(keys))
+
+
+def _begun(env: Env, state: Any) -> Episodes:
+    count = len(state.reward)
     zero, none = jnp.zeros_like(state.reward), jnp.zeros(count, jnp.int32)
     never = jnp.full_like(zero, jnp.nan)
     nothing = state.pipeline_state, jnp.zeros((count, env.action_size), zero.dtype)
@@ -68,6 +73,15 @@ def _record(episodes: Episodes, attempt: Any, valid: Bool[Array, " N"]) -> Episo
     return episodes._replace(nonfinite=episodes.nonfinite + ~valid, incident=where(valid, episodes.incident, attempt))
 
 
+def _ends(state: Any) -> tuple[Bool[Array, " N"], Bool[Array, " N"] | bool]:
+    """Which worlds the task ended, and which it cut short: those that are done with `truncation` in `info`, as Brax has it."""
+    done = state.done > 0
+    if "truncation" not in state.info:
+        return done, False
+    cut = done & (state.info["truncation"] > 0)
+    return done & ~cut, cut
+
+
 def _advance(episodes: Episodes, after: Any, step: Transition, fresh: Episodes) -> Episodes:
     """The worlds after a step: those whose episode ended begin a fresh one."""
     done = step.terminated | step.truncated
@@ -85,10 +99,10 @@ def _advance(episodes: Episodes, after: Any, step: Transition, fresh: Episodes) 
 def rollout(env: Env, act: Act, episodes: Episodes, keys: Key[Array, "T N"], *, episode_length: int) -> tuple[Episodes, Transition]:
     """T steps in every world, each with a key of its own, so that it does not matter how worlds are divided over devices.
 
-    The action is clipped to the actuators' range before it acts, not in the record. An episode that ends is followed by a fresh
-    random one; `next_obs` stays the observation in which it ended. A world whose action, state, reward or observation turns
-    non-finite is quarantined: its episode ends there as terminated with reward 0, the step is marked as not `valid`, and only
-    finite numbers leave this function.
+    The action is clipped to the actuators' range before it acts, not in the record. The time limit is `episode_length`, or the
+    task's own if that comes first. An episode that ends is followed by a fresh random one; `next_obs` stays the observation in which
+    it ended. A world whose action, state, reward or observation turns non-finite is quarantined: its episode ends there as terminated
+    with reward 0, the step is marked as not `valid`, and only finite numbers leave this function.
     """
     low, high = env.action_range
 
@@ -98,11 +112,13 @@ def rollout(env: Env, act: Act, episodes: Episodes, keys: Key[Array, "T N"], *, 
         action, log_prob = act(act_keys, before.obs)
         after = jax.vmap(env.step)(before, jnp.clip(action, low, high))
         valid = finite((before.obs, action, log_prob, after.pipeline_state, after.reward, after.obs, after.done))
-        terminated = (after.done > 0) | ~valid
-        truncated = ~terminated & (episodes.steps + 1 >= episode_length)
+        over, cut = _ends(after)
+        terminated = over | ~valid
+        truncated = ~terminated & (cut | (episodes.steps + 1 >= episode_length))
         step = Transition(before.obs, action, log_prob, after.reward, terminated, truncated, after.obs, valid)  # pyright: ignore[reportArgumentType]
         step = _quarantine(step, valid)
         episodes = _record(episodes, (before.pipeline_state, action), valid)
-        return _advance(episodes, after, step, start(env, reset_keys)), step
+        again = jax.vmap(partial(restart, env))(after, reset_keys, terminated | truncated)
+        return _advance(episodes, after, step, _begun(env, again)), step
 
     return jax.lax.scan(one, episodes, keys)

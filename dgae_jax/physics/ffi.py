@@ -13,7 +13,7 @@ import jax
 import numpy as np
 
 _MAJOR, _MINOR = 0, 1  # of the interface; JAX 0.10 and 0.12 accept it
-_DTYPES = {11: np.float32, 12: np.float64}
+_DTYPES = {1: np.bool_, 4: np.int32, 8: np.uint32, 11: np.float32, 12: np.float64}
 _INTERNAL = 13
 """XLA's error code of a defect in the called function."""
 

@@ -12,7 +12,9 @@ import jax
 import numpy as np
 
 from dgae_jax.configs.build import make_greedy, make_quantiles, make_task
-from dgae_jax.configs.config import Config, ConfigError, resolve
+from dgae_jax.configs.config import Config, ConfigError, invalid, resolve
+from dgae_jax.envs.base import Env
+from dgae_jax.envs.registry import given
 from dgae_jax.learn.types import Fitted
 from dgae_jax.run import loop, metrics, restore, terminal
 from dgae_jax.run.options import RunOptions
@@ -65,34 +67,44 @@ class Run(NamedTuple):
     """The run directory, None if it was temporary."""
 
 
-def train(config: Config, run_dir: str | Path | None = None, *, quiet: bool = False, **options: Any) -> Run:
+def train(config: Config, run_dir: str | Path | None = None, *, env: Env | None = None, quiet: bool = False, **options: Any) -> Run:
     """Train, evaluate and return the whole of a run, as the command line does.
 
-    Without `run_dir` it is written to a temporary directory and removed at the end. `options` are fields of `RunOptions`
-    (`episodes=5`, `checkpoint_every=50_000`, `resume_or_start=True`, …); `quiet` prints nothing but warnings. Raises
-    ConfigError for an invalid setting before anything is written, and RunError if the run ends early, by a signal too: its
-    message says how to go on, from a directory that stays, even a temporary one.
+    `env` is an environment of one's own, which takes the place of the task that `config` names; the run is recorded as one of
+    `custom:` and the name of its class. Without `run_dir` it is written to a temporary directory and removed at the end. `options`
+    are fields of `RunOptions` (`episodes=5`, `checkpoint_every=50_000`, `resume_or_start=True`, …); `quiet` prints nothing but
+    warnings. Raises ConfigError for an invalid setting before anything is written, and RunError if the run ends early, by a signal
+    too: its message says how to go on, from a directory that stays, even a temporary one.
     """
     names = [f.name for f in dataclasses.fields(RunOptions) if f.name not in ("run_dir", "resume")]
     for name in options:
         if name not in names:
             raise ConfigError(f"{name}: must be one of {', '.join(names)}")
-    with terminal.silenced(quiet), _directory(run_dir) as path:
+    with terminal.silenced(quiet), given(env) as name, _directory(run_dir) as path:
+        config = config if name is None else dataclasses.replace(config, env=name)
         chosen = RunOptions(run_dir=path, **options)
         evaluation = (loop.go_on_or_start if chosen.resume_or_start else loop.start)(config, chosen).evaluation
-        return Run(load_policy(path), metrics.read(path / "metrics.jsonl"), evaluation, None if run_dir is None else path)
+        return Run(load_policy(path, env=env), metrics.read(path / "metrics.jsonl"), evaluation, None if run_dir is None else path)
 
 
-def load_policy(run_dir: str | Path, which: str = "newest", *, seed: int = 0) -> Policy:
+def load_policy(run_dir: str | Path, which: str = "newest", *, seed: int = 0, env: Env | None = None) -> Policy:
     """The policy of a run's newest checkpoint, or of its best evaluation's (`which="best"`); `run_dir` may be a policy's file.
 
-    `seed` is the index among the seeds trained side by side (`num_seeds`). Only networks and observation statistics are read.
-    Raises ConfigError for an invalid argument or a directory that holds no run, CheckpointError if no checkpoint can be read.
+    `seed` is the index among the seeds trained side by side (`num_seeds`), `env` the object that `train` was given. Only networks and
+    observation statistics are read. Raises ConfigError for an invalid argument or a directory that holds no run, CheckpointError if
+    no checkpoint can be read.
     """
-    config = resolve(restore.config_of(Path(run_dir)))
+    with given(env) as name:
+        config = resolve(restore.config_of(Path(run_dir)))
+        if name not in (None, config.env):
+            raise invalid("env", name, f"left out: {run_dir} is a run of {config.env}")
+        return _load(Path(run_dir), config, which, seed)
+
+
+def _load(run_dir: Path, config: Config, which: str, seed: int) -> Policy:
     if not (type(seed) is int and 0 <= seed < config.num_seeds):
         raise ConfigError(f"seed {seed}: must be a whole number from 0 to {config.num_seeds - 1}, the index of a trained seed")
-    found = restore.trained(Path(run_dir), config, which)
+    found = restore.trained(run_dir, config, which)
     policy, critic = jax.tree.map(lambda x: x[seed], (found.policy, found.critic))
     return Policy(policy, critic, config)
 

@@ -30,7 +30,7 @@ class InUseError(ConfigError):
 
 def default_path(config: Config) -> Path:
     """runs/ENV-ALGO-SEED-TIME below the working directory."""
-    return Path("runs") / f"{config.env}-{config.algo}-{config.seed}-{time.strftime('%Y%m%d-%H%M%S')}"
+    return Path("runs") / f"{config.env.replace('/', '_')}-{config.algo}-{config.seed}-{time.strftime('%Y%m%d-%H%M%S')}"
 
 
 def create(path: Path, config: Config, options: RunOptions) -> None:

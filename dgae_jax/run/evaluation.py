@@ -13,7 +13,7 @@ import numpy as np
 
 from dgae_jax.configs.build import make_greedy, make_task, make_trainer
 from dgae_jax.configs.config import Config, invalid
-from dgae_jax.envs.registry import spec_of
+from dgae_jax.envs.registry import GIVEN, spec_of
 from dgae_jax.learn import play
 from dgae_jax.learn.parallel import Trainer
 from dgae_jax.learn.types import Fitted
@@ -26,14 +26,40 @@ CHUNK = 50
 
 
 def engines_of(config: Config) -> tuple[str, ...]:
-    """Where a run can be evaluated, the referee first: Gymnasium for our tasks, the run's own physics for any other."""
+    """Where a run can be evaluated, the referee first: Gymnasium for our tasks and its own, the run's own physics for any other."""
     spec = spec_of(config.env)
     return ("gymnasium", *spec.engines) if spec.referees else spec.engines
 
 
 def referee(config: Config) -> str:
-    """Gymnasium's name of the task, or Brax's."""
+    """Gymnasium's name of the task, or ours where Gymnasium does not play it."""
     return spec_of(config.env).referee(config.env_version) or config.env
+
+
+def time_limit(config: Config) -> int:
+    """Steps of the longest episode: the run's own limit, or that of a task of Gymnasium's if it is shorter."""
+    gymnasium_id = spec_of(config.env).gymnasium_id
+    if gymnasium_id is None:
+        return config.episode_length
+    from dgae_jax.envs.gymnasium import make_world
+
+    world = make_world(gymnasium_id)
+    world.close()
+    own = world.spec and world.spec.max_episode_steps
+    return min(config.episode_length, own or config.episode_length)
+
+
+def make_referee(config: Config) -> Any:
+    """A world of the task in Gymnasium, with the time limit that episodes in training have."""
+    import gymnasium  # here, so that training alone does not import it
+
+    if spec_of(config.env).gymnasium_id is None:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # that v4 is not the newest version is known
+            return gymnasium.make(referee(config), max_episode_steps=config.episode_length)
+    from dgae_jax.envs.gymnasium import make_world
+
+    return gymnasium.wrappers.TimeLimit(make_world(referee(config)), config.episode_length)  # beside the task's own
 
 
 def default_path(source: Path, engine: str, which: str) -> Path:
@@ -101,8 +127,10 @@ class _Progress(NamedTuple):
 
 
 @lru_cache(maxsize=1)
-def _programs(config: Config) -> tuple[Trainer, Callable[[Fitted, play.Play, int], play.Play]]:
-    """In the physics of `config`: the trainer, and `go_on(policy, episodes, until) -> episodes`."""
+def _programs(config: Config, given: Any) -> tuple[Trainer, Callable[[Fitted, play.Play, int], play.Play]]:
+    """In the physics of `config`, for the object that its task's name stands for now, if it does for one: the trainer, and
+    `go_on(policy, episodes, until) -> episodes`.
+    """
     env = make_task(config)
     greedy = make_greedy(env, config)
     return make_trainer(env, 1), jax.jit(lambda policy, now, until: play.play(env, lambda obs: greedy(policy, obs), now, until))
@@ -114,7 +142,7 @@ def _fresh_worlds(config: Config, seed: int, episodes: int, progress: _Progress)
     They are taken from fresh training states: a reset of Brax's takes half a minute to compile, and JAX's cache already has
     this program, or will.
     """
-    init = _programs(config)[0].init
+    init = _programs(config, GIVEN.get(config.env))[0].init
     batches = -(-episodes // (config.num_seeds * config.num_envs))
     numbers = [np.random.SeedSequence((seed, i)).generate_state(config.num_seeds) for i in range(batches)]
     keys = [jnp.stack([jax.random.key(int(n)) for n in each]) for each in numbers]
@@ -125,7 +153,7 @@ def _fresh_worlds(config: Config, seed: int, episodes: int, progress: _Progress)
 
 def _in_jax(policy: Fitted, config: Config, engine: str, episodes: int, seed: int, progress: _Progress) -> np.ndarray:
     config = dataclasses.replace(config, physics=engine)
-    now, go_on = play.begin(_fresh_worlds(config, seed, episodes, progress)), _programs(config)[1]
+    now, go_on = play.begin(_fresh_worlds(config, seed, episodes, progress)), _programs(config, GIVEN.get(config.env))[1]
     compile_aside(go_on, policy, now, 1, watch=progress.watch, what=f"{progress.what}: compiling steps")
     while (step := int(now.step)) < config.episode_length and (alive := int(now.alive.sum())):
         progress(step, alive)
@@ -134,18 +162,14 @@ def _in_jax(policy: Fitted, config: Config, engine: str, episodes: int, seed: in
 
 
 @lru_cache(maxsize=1)
-def _greedy(config: Config):
+def _greedy(config: Config, given: Any):
     return jax.jit(make_greedy(make_task(config), config))
 
 
 def _in_gymnasium(policy: Fitted, config: Config, engine: str, episodes: int, seed: int, progress: _Progress) -> np.ndarray:
     """Gymnasium's own task in C MuJoCo, the referee: episodes side by side, one batched policy call per step."""
-    import gymnasium  # here, so that training alone does not import it
-
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # that v4 is not the newest version is known
-        worlds = [gymnasium.make(referee(config), max_episode_steps=config.episode_length) for _ in range(episodes)]
-    greedy = _greedy(config)
+    worlds = [make_referee(config) for _ in range(episodes)]
+    greedy = _greedy(config, GIVEN.get(config.env))
     starts = zip(episode_seeds(seed, episodes), worlds, strict=True)
     obs = np.stack([world.reset(seed=int(number))[0] for number, world in starts])
     compile_aside(greedy, policy, obs.astype(np.float32), watch=progress.watch, what=f"{progress.what}: compiling")

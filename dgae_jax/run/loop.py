@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from dgae_jax.configs.build import make_task
-from dgae_jax.configs.config import Config, ConfigError, invalid
+from dgae_jax.configs.config import Config, ConfigError, invalid, task_spec
 from dgae_jax.configs.memory import check_memory
 from dgae_jax.configs.serial import MAY_CHANGE, differences
 from dgae_jax.configs.validation import validate
@@ -16,7 +16,7 @@ from dgae_jax.run import checkpoint, compiling, directory, hosts, machine, manif
 from dgae_jax.run.evaluations import EvaluationsFile
 from dgae_jax.run.options import RunOptions, validate_options
 from dgae_jax.run.summary import describe
-from dgae_jax.run.training import Heed, RunError, run_to_end, unheeded
+from dgae_jax.run.training import Heed, RunError, TaskFailedError, run_to_end, unheeded
 
 
 class Finished(NamedTuple):
@@ -78,13 +78,13 @@ def resume_or_start(config: Config, options: RunOptions) -> int:
 
 
 def _exit_code(work: Callable[[Config, RunOptions], Finished], config: Config, options: RunOptions) -> int:
-    """Say how it went. Where XLA is left compiling the process ends here, since Python would wait for it."""
+    """Say how it went. The process ends here where Python would wait for XLA, or JAX say a task's failure again, with its own stack."""
     try:
         finished = work(config, options)
     except RunError as end:
         if hosts.is_first():
             (terminal.say if end.exit_code > 128 else terminal.warn)(str(end))
-        if compiling.is_running():
+        if compiling.is_running() or isinstance(end, TaskFailedError):
             os._exit(end.exit_code)
         return end.exit_code
     with terminal.silenced(not hosts.is_first()):
@@ -105,6 +105,9 @@ def _prepared(config: Config, options: RunOptions) -> tuple[Config, RunOptions]:
 def _compare(config: Config, saved: Config, run_dir: Path, options: RunOptions) -> None:
     """Refuse what would not continue the run `saved`, but for what --inexact allows."""
     changed, inexact = differences(config, saved), options.inexact
+    on_host = task_spec(config).on_host
+    if on_host and not inexact:
+        raise ConfigError(f"resume {run_dir}: must be with --inexact; the worlds of {config.env} are not in a checkpoint", "resume")
     for path, (ours, theirs) in changed.items():
         if path not in MAY_CHANGE or (path == "physics" and not inexact):
             raise invalid(path, ours, f"{theirs} as in {run_dir}, or left out")
@@ -114,6 +117,8 @@ def _compare(config: Config, saved: Config, run_dir: Path, options: RunOptions) 
     if "physics" in changed:
         ours, theirs = changed["physics"]
         _warn_of_another_sample(f"physics {ours} (was {theirs}): one step differs by up to 1e-4, of ant on mjx by up to 1")
+    if on_host:
+        _warn_of_another_sample(f"the worlds of {config.env} are not in a checkpoint and begin new episodes")
     if elsewhere:
         _warn_of_another_sample(f"{elsewhere}: rounding differs, by up to 1e-6 relative per operation, if nothing else does")
 
@@ -134,4 +139,4 @@ def _last_state(run_dir: Path, config: Config) -> TrainState | None:
     if config.total_steps < done:
         raise invalid("total_steps", config.total_steps, f"at least the {done} that are done in {run_dir}")
     terminal.say(f"resuming from {path.name}")
-    return state
+    return restore.in_new_episodes(state, config) if task_spec(config).on_host else state

@@ -8,7 +8,7 @@ from typing import Any
 
 import jax
 
-from dgae_jax.configs.config import Config, ConfigError, invalid
+from dgae_jax.configs.config import Config, ConfigError, invalid, task_spec
 from dgae_jax.learn.devices import divide_cpu
 from dgae_jax.physics.cores import cores
 from dgae_jax.physics.registry import ENGINES
@@ -29,7 +29,7 @@ def use_devices(config: Config, options: RunOptions) -> int:
     Raises ConfigError if there is none of the kind asked for, or they are not there or do not divide worlds or seeds.
     """
     hosts.join(options)
-    wanted = options.devices
+    wanted = _wanted(config, options)
     with contextlib.suppress(RuntimeError):  # JAX runs already, and has the devices that it has
         divide_cpu(wanted or _dividing(config, cores(), WORLDS_PER_CORE))
     _start(config)
@@ -45,6 +45,16 @@ def use_devices(config: Config, options: RunOptions) -> int:
         many = f" in each of {processes} processes" if processes > 1 else ""
         raise invalid("devices", count, f"a number that divides num_envs {config.num_envs} or num_seeds {config.num_seeds}{many}")
     return count
+
+
+def _wanted(config: Config, options: RunOptions) -> int | None:
+    """The number of devices that is asked for; a task whose worlds live in this process has one."""
+    if not task_spec(config).on_host:
+        return options.devices
+    for name, value in (("devices", options.devices), ("num_processes", jax.process_count())):
+        if value not in (None, 1):
+            raise invalid(name, value, f"1 with {config.env}, whose worlds are stepped one after the other in one process")
+    return 1
 
 
 def _dividing(config: Config, most: int, worlds_each: int) -> int:
@@ -64,7 +74,9 @@ def _start(config: Config) -> None:
         wanted, why = os.environ.get("JAX_PLATFORMS", ""), str(reason) or type(reason).__name__
         gpu = "" if wanted == "cpu" else 'an NVIDIA GPU needs pip install "dgae_jax[cuda13]"; '
         raise ConfigError(f"JAX_PLATFORMS={wanted}: must name a device that JAX finds here, cpu for one; {gpu}JAX says: {why}") from reason
-    if ENGINES[str(config.physics)].on_host and kind != "cpu":
+    if task_spec(config).on_host and kind != "cpu":
+        raise ConfigError(f"JAX_PLATFORMS={os.environ.get('JAX_PLATFORMS', '')}: must be cpu with {config.env}; JAX is on the {kind}")
+    if kind != "cpu" and config.physics in ENGINES and ENGINES[config.physics].on_host:
         terminal.warn(
             f"warning: --physics {config.physics} simulates on the CPU and everything else runs on the {kind}, so that each step crosses"
             f" between them; --physics jax or JAX_PLATFORMS=cpu keeps all in one place"

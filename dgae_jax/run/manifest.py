@@ -13,7 +13,7 @@ from typing import Any
 from dgae_jax.run import files
 from dgae_jax.run.options import RunOptions, from_dict, to_dict
 
-_VERSIONS_OF = ("dgae_jax", "jax", "jaxlib", "flax", "optax", "brax", "mujoco", "mujoco-mjx", "gymnasium", "numpy")
+_VERSIONS_OF = ("dgae_jax", "jax", "jaxlib", "flax", "optax", "brax", "mujoco", "mujoco-mjx", "playground", "gymnasium", "numpy")
 
 
 def write(run_dir: Path, options: RunOptions) -> None:

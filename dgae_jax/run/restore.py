@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from dgae_jax.configs.build import make_task, make_trainer, seed_keys
@@ -94,6 +95,15 @@ def load_state(path: Path, config: Config) -> TrainState:
         if path.name != checkpoint.name_of(int(iteration) * config.samples_per_iteration):
             raise CheckpointError(f"{path}: is renamed, it was saved after {iteration} iterations")
     return state
+
+
+def in_new_episodes(state: TrainState, config: Config) -> TrainState:
+    """The training state with every world at the beginning of an episode, as it is after no other number of iterations."""
+    keys = jax.vmap(jax.random.fold_in)(seed_keys(config), state.iteration)
+    new = make_trainer(make_task(config), 1).init(config, keys).episodes
+    episodes = state.episodes._replace(env=new.env, steps=new.steps, total=new.total)
+    scale = state.reward_scale._replace(discounted=jnp.zeros_like(state.reward_scale.discounted))
+    return state._replace(episodes=episodes, reward_scale=scale)
 
 
 def save_networks(path: Path, config: Config, networks: Trained) -> None:

@@ -10,7 +10,7 @@ import jax
 import numpy as np
 
 from dgae_jax.configs.build import make_task, make_trainer, policies_of, seed_keys
-from dgae_jax.configs.config import Config
+from dgae_jax.configs.config import Config, task_spec
 from dgae_jax.learn.devices import make_mesh
 from dgae_jax.learn.parallel import Trainer
 from dgae_jax.learn.types import TrainState
@@ -40,6 +40,10 @@ class RunError(RuntimeError):
 
 class BrokeDownError(RunError):
     """A run whose updates or worlds are not finite any more: its settings are to blame, not the machine."""
+
+
+class TaskFailedError(RunError):
+    """A run whose task raised an exception in the middle of a program."""
 
 
 Heed = Callable[[int, dict[str, Any]], None]
@@ -74,10 +78,12 @@ def run_to_end(config: Config, options: RunOptions, run_dir: Path, state: TrainS
             name = reason.filename or "output"
             raise RunError(1, f"stopped: {name}: cannot be written ({reason.strerror}); {_left(run_dir)}") from reason
         except (MemoryError, jax.errors.JaxRuntimeError) as reason:
-            if not _is_out_of_memory(reason):
-                raise
             why = str(reason).partition("\n")[0][:200] or type(reason).__name__
-            raise RunError(1, f"stopped: out of memory ({why}); {_left(run_dir)}") from reason
+            if _is_out_of_memory(reason):
+                raise RunError(1, f"stopped: out of memory ({why}); {_left(run_dir)}") from reason
+            if task_spec(config).on_host:
+                raise TaskFailedError(1, f"stopped: {config.env} failed ({why}); {_left(run_dir)}") from reason
+            raise
     return result
 
 

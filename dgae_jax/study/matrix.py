@@ -87,11 +87,7 @@ def _groups(seeds: Sequence[int], per_run: int) -> Iterator[Sequence[int]]:
 
 def _name(task: str, kind: str, seeds: Sequence[int]) -> str:
     last = f"-{seeds[-1]}" if len(seeds) > 1 else ""
-    return f"{_file_name(task)}-{kind}-{seeds[0]}{last}"
-
-
-def _file_name(task: str) -> str:
-    return task.replace(":", "_")
+    return f"{re.sub('[:/]', '_', task)}-{kind}-{seeds[0]}{last}"
 
 
 @contextlib.contextmanager

@@ -8,8 +8,10 @@ from numpy.testing import assert_array_equal
 
 import dgae_jax as dg
 import dgae_jax.envs.brax
-from dgae_jax.envs.registry import BRAX_NAMES, TASKS, spec_of
+from dgae_jax.envs import registry
+from dgae_jax.envs.registry import BRAX_NAMES, TASKS, given, spec_of
 from dgae_jax.physics.registry import ENGINES
+from tests.probes import Counter
 
 
 @pytest.mark.parametrize("name", TASKS)
@@ -29,12 +31,38 @@ def test_braxs_own_tasks_run_on_mjx_and_evaluate_themselves():
     assert spec.referee() is None
 
 
-@pytest.mark.parametrize("name", ["hoper", "brax:", "brax:nope", "brax:swimmer", "brax:dgae_ant", ""])
-def test_an_unknown_task_is_refused_with_what_exists(name):
-    with pytest.raises(ValueError, match=r"^one of ant, hopper, swimmer, walker2d, or brax:NAME with NAME one of ant, fast"):
+PREFIXES = "one of ant, hopper, swimmer, walker2d, or brax:NAME, playground:NAME or gymnasium:ID"
+
+
+@pytest.mark.parametrize(
+    ("name", "allowed"),
+    [
+        *((name, PREFIXES) for name in ("hoper", "brax:", "gymnasium:", "")),
+        *((f"brax:{name}", "brax:NAME with NAME one of ant, fast") for name in ("nope", "swimmer", "dgae_ant")),
+        ("custom:Mine", "given as an object from Python"),
+    ],
+)
+def test_an_unknown_task_is_refused_with_what_exists(name, allowed):
+    with pytest.raises(ValueError, match=f"^{allowed}"):
         spec_of(name)
-    with pytest.raises(ValueError, match=f"^environment {name}: must be one of ant"):
+    with pytest.raises(ValueError, match=f"^environment {name}: must be {allowed}"):
         dg.make_env(name)
+
+
+def test_a_task_whose_package_is_missing_is_refused_with_how_to_install_it(monkeypatch):
+    monkeypatch.setattr(registry, "find_spec", lambda name: None)
+    with pytest.raises(ValueError, match=r'not installed: pip install "dgae_jax\[playground\]"$'):
+        spec_of("playground:CartpoleBalance")
+
+
+def test_an_object_is_a_task_by_the_name_of_its_class_while_the_context_lasts():
+    inner, outer = Counter(), Counter()
+    with given(outer) as name, given(inner):
+        assert name == "custom:Counter"
+        assert dg.make_env(name).env is inner
+        with given(None) as nothing:
+            assert nothing is None
+    assert registry.GIVEN == {}
 
 
 @pytest.mark.parametrize(

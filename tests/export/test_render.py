@@ -173,7 +173,7 @@ def test_render_refuses_a_run_that_gymnasium_cannot_play_a_seed_that_is_not_ther
     (tmp_path / "run" / "config.json").write_text(json.dumps(config))
     code, _, err = run("render", tmp_path / "run")
     assert code == 2
-    assert re.fullmatch(r"error: \S+: must be a run of ant, hopper, swimmer, walker2d, which Gymnasium plays; it is one of brax:ant\n", err)
+    assert re.fullmatch(r"error: \S+: must be a run of ant, hopper, swimmer, walker2d, which can be filmed; it is one of brax:ant\n", err)
 
 
 @pytest.mark.parametrize("module", ["mediapy", "imageio_ffmpeg"])

@@ -1,0 +1,88 @@
+"""Environments given as objects: what they may leave out, and what is refused before anything is compiled."""
+
+import jax.numpy as jnp
+import pytest
+from brax.envs.wrappers.training import EpisodeWrapper
+from numpy.testing import assert_array_equal
+
+import dgae_jax as dg
+from dgae_jax.envs.given import with_range
+from dgae_jax.envs.registry import given
+from dgae_jax.learn.rollout import rollout, start
+from tests.probes import Counter
+
+
+class Bare(Counter):
+    """A counter that says nothing of its actions' range."""
+
+    @property
+    def action_range(self):
+        raise AttributeError
+
+
+class TwoAxes(Bare):
+    observation_size = 3
+
+
+class Named(Bare):
+    def reset(self, rng):
+        state = super().reset(rng)
+        return state.replace(obs={"state": state.obs})
+
+    def step(self, state, action):
+        return state
+
+
+class Growing(Bare):
+    def step(self, state, action):
+        return super().step(state, action).replace(info={"extra": jnp.zeros(3)})
+
+
+class Wholes(Bare):
+    def step(self, state, action):
+        return super().step(state, action).replace(reward=jnp.int32(1))
+
+
+class Broken(Bare):
+    def step(self, state, action):
+        raise KeyError("wind\nand rain")
+
+
+def made(env):
+    with given(env) as name:
+        return dg.make_env(name)
+
+
+def test_actions_lie_between_minus_one_and_one_unless_the_environment_says_otherwise():
+    assert_array_equal(made(Bare()).action_range, [[-1], [1]])
+    wide = type("Wide", (Counter,), {"action_range": (-2.0, 3.0)})()
+    assert_array_equal(made(wide).action_range, [[-2], [3]])
+    assert with_range(wide) is wide
+
+
+@pytest.mark.parametrize(
+    ("env", "reason"),
+    [
+        (3, "int is not a brax.envs.base.Env"),
+        (TwoAxes(), r"the observation of its reset has shape float32\[2\], and must be one array \[observation_size\]"),
+        (Named(), r"the observation of its reset has shape state: float32\[2\], and must be one array \[observation_size\]"),
+        (Growing(), r"its step turns state.info\['extra'\] from nothing into float32\[3\], and must leave it as it is"),
+        (Wholes(), "the reward of its step is .*int32.*, and must be a single real number"),
+        (Broken(), r"its step cannot be compiled by JAX \(KeyError: 'wind\\nand rain'\)"),
+    ],
+)
+def test_an_object_that_the_trainer_cannot_take_is_refused_with_the_reason(env, reason):
+    with pytest.raises(ValueError, match=f"^{reason}$"):
+        made(env)
+
+
+def test_a_truncation_that_an_environment_marks_is_one_and_the_next_episode_is_fresh(key):
+    env = made(EpisodeWrapper(Counter(), 5, 1))
+
+    def act(keys, obs):
+        return jnp.zeros((len(obs), 1)), jnp.zeros(len(obs))
+
+    _, step = rollout(env, act, start(env, key[None]), jnp.tile(key, (12, 1)), episode_length=100)
+    assert_array_equal(jnp.flatnonzero(step.truncated), [4, 9])
+    assert not step.terminated.any()
+    assert_array_equal(step.next_obs[:, 0, 0], [1, 2, 3, 4, 5, 1, 2, 3, 4, 5, 1, 2])

@@ -1,0 +1,56 @@
+"""Tasks of MuJoCo Playground, where it is installed."""
+
+from importlib.util import find_spec
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose, assert_array_equal
+
+import dgae_jax as dg
+from dgae_jax.learn.rollout import rollout, start
+
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.skipif(find_spec("mujoco_playground") is None, reason="playground is not installed"),
+    pytest.mark.filterwarnings("default"),  # its own
+]
+
+
+def test_a_task_that_does_not_exist_is_refused_with_its_neighbours():
+    with pytest.raises(ValueError, match="Playground has no CartpoleBalanced, but CartpoleBalance"):
+        dg.make_env("playground:CartpoleBalanced")
+
+
+def test_a_task_whose_robot_would_be_downloaded_is_refused(monkeypatch, tmp_path):
+    from mujoco_playground._src import mjx_env
+
+    monkeypatch.setattr(mjx_env, "MENAGERIE_PATH", tmp_path / "mujoco_menagerie")
+    monkeypatch.setattr(mjx_env, "ensure_menagerie_exists", lambda: pytest.fail("a download"))
+    with pytest.raises(ValueError, match="its robot is in mujoco_menagerie, which Playground looks for in .* and would download"):
+        dg.make_env("playground:Go1Getup")
+
+
+def test_a_task_is_playgrounds_own_with_its_time_limit_as_a_truncation(key):
+    from mujoco_playground import registry
+
+    env, theirs = dg.make_env("playground:CartpoleBalance"), registry.load("CartpoleBalance", config_overrides={"impl": "jax"})
+    assert (env.observation_size, env.action_size, env.backend) == (5, 1, "mjx")
+    assert_array_equal(env.action_range, [[-1], [1]])
+
+    def act(keys, obs):
+        return jnp.tanh(obs[:, :1]), jnp.zeros(len(obs))
+
+    keys = jax.random.split(key, (1010, 1))
+    first = jax.jit(lambda key: start(env, key[None]))(key)
+    _, step = jax.jit(lambda first: rollout(env, act, first, keys, episode_length=10**6))(first)
+    assert step.valid.all()
+    assert not step.terminated.any()
+    assert_array_equal(np.flatnonzero(step.truncated), [999])
+    state, reset, advance = None, jax.jit(theirs.reset), jax.jit(theirs.step)
+    for t in range(20):
+        state = reset(key) if state is None else state
+        state = advance(state, step.action[t, 0])
+        assert_allclose(step.next_obs[t, 0], state.obs, atol=1e-5)
+        assert_allclose(step.reward[t, 0], state.reward, atol=1e-5)
