@@ -7,7 +7,7 @@ import pytest
 
 from benchmarks.table import table
 from dgae_jax.configs.algorithms import TABLE
-from dgae_jax.configs.parts import UPDATES
+from dgae_jax.configs.parts import COVARIANCES, CRITICS, OPTIMIZERS, TARGETS, UPDATES
 from dgae_jax.configs.serial import to_dict
 from dgae_jax.maths.risk import METRICS
 from dgae_jax.report import markdown, results
@@ -16,8 +16,14 @@ from dgae_jax.run import restore
 from tests.helpers import ROOT
 
 DOCUMENTS = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+SLOW = {"python.md"}
+"""Documents whose blocks train networks that no other test compiles."""
 BLOCKS = [
-    pytest.param(block, id=f"{path.name}:{text[: text.index(block)].count(chr(10)) + 1}")
+    pytest.param(
+        block,
+        id=f"{path.name}:{text[: text.index(block)].count(chr(10)) + 1}",
+        marks=[pytest.mark.slow] if path.name in SLOW else [],
+    )
     for path in DOCUMENTS
     for text in [path.read_text()]
     for block in re.findall(r"^```python\n(.*?)^```", text, re.MULTILINE | re.DOTALL)
@@ -27,7 +33,7 @@ BLOCKS = [
 @pytest.mark.parametrize("block", BLOCKS)
 def test_a_block_of_code_runs_as_it_is_printed(block, monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
-    tables = [(table, dict(table)) for table in (TABLE, UPDATES, METRICS)]
+    tables = [(table, dict(table)) for table in (TABLE, UPDATES, METRICS, COVARIANCES, CRITICS, OPTIMIZERS, TARGETS)]
     try:
         exec(compile(block, "document", "exec"), {"__name__": "document"})
     finally:
