@@ -7,7 +7,7 @@ import pytest
 
 from benchmarks.table import table
 from dgae_jax.configs.algorithms import TABLE
-from dgae_jax.configs.parts import UPDATES
+from dgae_jax.configs.parts import COVARIANCES, CRITICS, OPTIMIZERS, TARGETS, UPDATES
 from dgae_jax.configs.serial import to_dict
 from dgae_jax.maths.risk import METRICS
 from dgae_jax.report import markdown, results
@@ -16,11 +16,14 @@ from dgae_jax.run import restore
 from tests.helpers import ROOT
 
 DOCUMENTS = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+TRAINS = re.compile(r"\b(train|train_step|learn)\(")
+"""What takes long; the README's are run by default."""
+
 BLOCKS = [
     pytest.param(
         block,
         id=f"{path.name}:{text[: text.index(block)].count(chr(10)) + 1}",
-        marks=pytest.mark.slow if block.startswith("# takes minutes") else (),
+        marks=pytest.mark.slow if TRAINS.search(block) and path.name != "README.md" else (),
     )
     for path in DOCUMENTS
     for text in [path.read_text()]
@@ -33,7 +36,7 @@ def test_a_block_of_code_runs_as_it_is_printed(block, monkeypatch, tmp_path):
     for package in re.findall(r"^# needs (\w+)$", block, re.MULTILINE):
         pytest.importorskip(package)
     monkeypatch.chdir(tmp_path)
-    tables = [(table, dict(table)) for table in (TABLE, UPDATES, METRICS)]
+    tables = [(table, dict(table)) for table in (TABLE, UPDATES, METRICS, COVARIANCES, CRITICS, OPTIMIZERS, TARGETS)]
     try:
         exec(compile(block, "document", "exec"), {"__name__": "document"})
     finally:

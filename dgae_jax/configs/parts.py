@@ -1,10 +1,10 @@
 """The parts that a configuration names: where each is built, and the settings it takes with their defaults.
 
 Builders are written `module:function` and imported when they are used, so that names and settings are checked before JAX is
-loaded. A part of your own joins its table, with the function itself in place of its name.
+loaded. A part of your own joins its table, with the thing itself in place of its name (docs/python.md).
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pkgutil import resolve_name
 from typing import Any
@@ -14,13 +14,14 @@ from typing import Any
 class Part:
     """An entry of a table of parts."""
 
-    builder: str | Callable
+    builder: str | Any
+    """`module:name`, or the thing itself: a function, or what the table says."""
     options: Mapping[str, Any] = field(default_factory=dict)
     """The settings it is built with, with their defaults; it does not use any other of its group."""
 
     @property
-    def build(self) -> Callable:
-        """The function itself."""
+    def build(self) -> Any:
+        """The thing itself."""
         return resolve_name(self.builder) if isinstance(self.builder, str) else self.builder
 
 
@@ -42,6 +43,12 @@ CRITICS = {
 }
 """What a critic predicts: `build(obs_size, hidden=, target=, **options) -> Critic`."""
 
+
+def is_distribution(critic: str) -> bool:
+    """Whether a critic of this name predicts a distribution, because it has quantiles."""
+    return "quantiles" in CRITICS[critic].options
+
+
 TARGETS = {
     "bellman": Part("dgae_jax.learn.critics:BELLMAN"),
     "bellman-frozen": Part("dgae_jax.learn.critics:BELLMAN_FROZEN"),
@@ -55,7 +62,7 @@ RESIDUALS = {"td": Part("dgae_jax.learn.critics:td"), "distributional": Part("dg
 """How two predictions become one number: `build(weights of the metric) -> residual(reward, discount, z, z_next)`."""
 
 COVARIANCES = {"shared": Part("dgae_jax.learn.networks:SharedCovariance"), "state": Part("dgae_jax.learn.networks:StateCovariance")}
-"""Where the actions' covariance comes from: a flax module of `hidden`, `actions` and `initial_std` that returns a Gaussian."""
+"""The policy's network, by where its covariance comes from: a flax module of `hidden`, `actions`, `initial_std` that gives a Gaussian."""
 
 OPTIMIZERS = {"adam": Part("dgae_jax.learn.updates:adam"), "rmsprop": Part("dgae_jax.learn.updates:rmsprop")}
 """How a gradient becomes a step: `build(learning rate or schedule) -> optax.GradientTransformation`."""

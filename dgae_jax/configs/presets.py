@@ -5,7 +5,7 @@ from typing import Any
 
 from dgae_jax.configs.algorithms import TABLE
 from dgae_jax.configs.config import Config, lookup
-from dgae_jax.configs.parts import CRITICS, UPDATES
+from dgae_jax.configs.parts import CRITICS, UPDATES, is_distribution
 
 Settings = dict[str, Any]
 """Fields of `Config`, nested dictionaries for its parts."""
@@ -26,7 +26,7 @@ def _tuned(update: str, critic: str, env: str) -> list[Settings]:
 def _paper(update: str, critic: str, env: str) -> list[Settings]:
     ant = env == "ant"
     hidden, constant = (512, 512) if ant else (256, 256), {"learning_rate_end": 1.0}
-    quantile = {"quantiles": 64, "target": "bellman"} if critic == "quantile" else {"target": "lambda-return"}
+    quantile = {"quantiles": 64, "target": "bellman"} if is_distribution(critic) else {"target": "lambda-return"}
     networks: Settings = {
         "total_steps": 10_000_000 if env in ("ant", "hopper") else 5_000_000,
         "policy": {"hidden": hidden, "covariance": "state", "initial_std": 1.0},

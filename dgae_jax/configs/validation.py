@@ -8,7 +8,7 @@ import math
 from typing import Any
 
 from dgae_jax.configs.config import Config, ConfigError, invalid, lookup, resolve, task_spec
-from dgae_jax.configs.parts import COVARIANCES, CRITICS, OPTIMIZERS, RESIDUALS, TARGETS, UPDATES
+from dgae_jax.configs.parts import COVARIANCES, CRITICS, OPTIMIZERS, RESIDUALS, TARGETS, UPDATES, is_distribution
 from dgae_jax.configs.serial import check_types
 from dgae_jax.maths.risk import check_metric
 from dgae_jax.physics.registry import ENGINES, require
@@ -138,7 +138,7 @@ def _check_use(config: Config) -> None:
         check_metric(config.metric)
     except ValueError as allowed:
         raise invalid("metric", config.metric, str(allowed)) from None
-    distribution = config.critic.kind == "quantile"
+    distribution = is_distribution(str(config.critic.kind))
     _check("diagnostics", config.diagnostics, distribution or not config.diagnostics, f"left out: the critic of {config.algo} is scalar")
     used = config.metric == "mean" or (config.residual == "distributional" and distribution)
     _check("metric", config.metric, used, f"mean with {config.algo}: other metrics need a distributional residual and a quantile critic")

@@ -77,7 +77,10 @@ def _compare(arrays: Arrays, policy: Policy, found: Trained) -> None:
     ours = outside.Policy(io.BytesIO(packed(arrays)))
     spread = np.random.default_rng(0).normal(size=(100, policy.observation_size))
     obs = arrays["observation_mean"] + 3 * spread * arrays["observation_std"]
-    outputs = {"actions": (ours(obs), policy(obs)), "quantiles": (ours.quantiles(obs), policy.quantiles(obs))}
+    try:
+        outputs = {"actions": (ours(obs), policy(obs)), "quantiles": (ours.quantiles(obs), policy.quantiles(obs))}
+    except ValueError as reason:
+        raise _foreign(found, "as plain layers they do not fit together") from reason
     for name, (a, b) in outputs.items():
         if a.shape != b.shape or not np.allclose(a, b, rtol=TOLERANCE, atol=TOLERANCE):
             raise _foreign(found, f"as plain layers their {name} differ")

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
-from dgae_jax.learn.networks import value_network
+from dgae_jax.learn.networks import Torso, value_network
 from dgae_jax.learn.types import Batch, Critic, Params
 from dgae_jax.maths.returns import (
     bellman_target,
@@ -55,8 +55,8 @@ SR_LAMBDA = Target(_sr_lambda)
 LAMBDA_RETURN = Target(_lambda_return)
 
 
-def _critic(obs_size: int, outputs: int, hidden: Sequence[int], target: Target, distance: Callable) -> Critic:
-    network = value_network(obs_size, outputs, hidden=hidden)
+def _critic(obs_size: int, outputs: int, hidden: Sequence[int], torso: Callable, target: Target, distance: Callable) -> Critic:
+    network = value_network(obs_size, outputs, hidden=hidden, torso=torso)
 
     def fitted_to(params: Params, batch: Batch) -> Array:
         if not target.recompute:
@@ -70,22 +70,22 @@ def _critic(obs_size: int, outputs: int, hidden: Sequence[int], target: Target, 
     return Critic(network.init, network.apply, target.compute, loss)
 
 
-def scalar(obs_size: int, *, hidden: Sequence[int], target: Target) -> Critic:
-    """V(s), fitted by half the squared error."""
+def scalar(obs_size: int, *, hidden: Sequence[int], target: Target, torso: Callable = Torso) -> Critic:
+    """V(s), fitted by half the squared error; `torso` is the flax module of its `hidden` layers."""
 
     def distance(value: Float[Array, "B 1"], target: Float[Array, "B 1"]) -> Float[Array, " B"]:
         return 0.5 * ((value - target) ** 2).mean(-1)
 
-    return _critic(obs_size, 1, hidden, target, distance)
+    return _critic(obs_size, 1, hidden, torso, target, distance)
 
 
-def quantile(obs_size: int, *, hidden: Sequence[int], target: Target, quantiles: int, kappa: ArrayLike) -> Critic:
-    """F⁻¹ of the return at K midpoints, fitted by the quantile-Huber loss (Eq. quantile_huber_loss)."""
+def quantile(obs_size: int, *, hidden: Sequence[int], target: Target, quantiles: int, kappa: ArrayLike, torso: Callable = Torso) -> Critic:
+    """F⁻¹ of the return at K midpoints, fitted by the quantile-Huber loss (Eq. quantile_huber_loss); `torso` as for `scalar`."""
 
     def distance(quantiles: Float[Array, "B K"], target: Float[Array, "B J"]) -> Float[Array, " B"]:
         return quantile_huber_loss(quantiles, target, kappa=kappa)
 
-    return _critic(obs_size, quantiles, hidden, target, distance)
+    return _critic(obs_size, quantiles, hidden, torso, target, distance)
 
 
 def td(weights: ArrayLike | None) -> Callable[..., Array]:

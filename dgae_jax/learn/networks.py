@@ -1,4 +1,4 @@
-"""Multilayer perceptrons for policies and value distributions.
+"""Networks for policies and value distributions: hidden layers, the torso, below a head.
 
 Orthogonal weights, zero biases, tanh between layers; the policy's last layer starts near zero, so that the first
 actions are noise around zero (Andrychowicz et al. 2021).
@@ -27,7 +27,7 @@ def _dense(width: int, scale: float, bias: ArrayLike = 0.0) -> nn.Dense:
 
 
 class Torso(nn.Module):
-    """Hidden tanh layers."""
+    """Hidden tanh layers; any other flax module of `hidden` may take its place in the modules below."""
 
     hidden: Sequence[int]
 
@@ -43,10 +43,11 @@ class Value(nn.Module):
 
     hidden: Sequence[int]
     outputs: int
+    torso: Callable[[Sequence[int]], nn.Module] = Torso
 
     @nn.compact
     def __call__(self, obs: Float[Array, "*batch O"]) -> Float[Array, "*batch K"]:
-        return _dense(self.outputs, 1.0)(Torso(self.hidden)(obs))
+        return _dense(self.outputs, 1.0)(self.torso(self.hidden)(obs))
 
 
 class SharedCovariance(nn.Module):
@@ -55,10 +56,11 @@ class SharedCovariance(nn.Module):
     hidden: Sequence[int]
     actions: int
     initial_std: ArrayLike
+    torso: Callable[[Sequence[int]], nn.Module] = Torso
 
     @nn.compact
     def __call__(self, obs: Float[Array, "*batch O"]) -> Gaussian:
-        mean = _dense(self.actions, 0.01)(Torso(self.hidden)(obs))
+        mean = _dense(self.actions, 0.01)(self.torso(self.hidden)(obs))
         log_std = self.param("log_std", nn.initializers.constant(jnp.log(self.initial_std)), (self.actions,))
         return Gaussian(mean, jnp.broadcast_to(log_std, mean.shape))
 
@@ -69,10 +71,11 @@ class StateCovariance(nn.Module):
     hidden: Sequence[int]
     actions: int
     initial_std: ArrayLike
+    torso: Callable[[Sequence[int]], nn.Module] = Torso
 
     @nn.compact
     def __call__(self, obs: Float[Array, "*batch O"]) -> Gaussian:
-        features = Torso(self.hidden)(obs)
+        features = self.torso(self.hidden)(obs)
         mean = _dense(self.actions, 0.01)(features)
         log_std = _dense(self.actions, 0.01, jnp.log(self.initial_std))(features)
         return Gaussian(mean, jnp.clip(log_std, -5.0, 2.0))
@@ -81,12 +84,14 @@ class StateCovariance(nn.Module):
 def gaussian_policy(
     obs_size: int, action_size: int, *, hidden: Sequence[int], covariance: Callable[..., nn.Module], initial_std: ArrayLike
 ) -> Policy:
-    """A Gaussian policy with mean and diagonal covariance (Sec. results, set-up); `covariance` is one of the modules above."""
+    """A Gaussian policy with mean and diagonal covariance (Sec. results, set-up); `covariance` is one of the two modules above,
+    or another of `hidden`, `actions` and `initial_std` that returns a Gaussian.
+    """
     module = covariance(tuple(hidden), action_size, initial_std)
     return Policy(lambda key: module.init(key, jnp.zeros(obs_size)), module.apply)
 
 
-def value_network(obs_size: int, outputs: int, *, hidden: Sequence[int]) -> Network:
+def value_network(obs_size: int, outputs: int, *, hidden: Sequence[int], torso: Callable[[Sequence[int]], nn.Module] = Torso) -> Network:
     """A head of `outputs` numbers: one scalar, or K quantiles (Sec. results, set-up)."""
-    module = Value(tuple(hidden), outputs)
+    module = Value(tuple(hidden), outputs, torso)
     return Network(lambda key: module.init(key, jnp.zeros(obs_size)), module.apply)

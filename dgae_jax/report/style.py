@@ -6,11 +6,14 @@ The colours are those of Okabe and Ito, which people with any colour vision tell
 from typing import NamedTuple
 
 from dgae_jax.configs.algorithms import TABLE
+from dgae_jax.configs.parts import is_distribution
 
 COLOURS = {"clip": "#0072B2", "trust-region": "#D55E00", "gradient": "#009E73"}
-LINES = {"scalar": "--", "quantile": "-"}
+OWN = "#56B4E9"
+"""For updates of somebody's own."""
+
 MARKERS = ("", "o", "s", "^", "D", "v", "P", "X")
-"""For settings that differ from the first ones of the algorithm."""
+"""For settings that differ from the first ones of the algorithm, and for rows of somebody's own that would look like another."""
 
 INK, FAINT = "#222222", "#777777"
 OTHER = "#CC79A7"
@@ -30,5 +33,7 @@ class Look(NamedTuple):
 def look(algo: str, number: int = 0) -> Look:
     """Of an algorithm's first settings, or of the others by their number."""
     row = TABLE[algo]
-    colour, line = COLOURS[row.policy_update], LINES[row.critic]
-    return Look(colour, line, MARKERS[number % len(MARKERS)], colour if line == "-" else "white")
+    colour, several = COLOURS.get(row.policy_update, OWN), is_distribution(row.critic)
+    alike = [n for n, other in TABLE.items() if (other.policy_update, is_distribution(other.critic)) == (row.policy_update, several)]
+    marker = MARKERS[(number + alike.index(algo)) % len(MARKERS)]
+    return Look(colour, "-" if several else "--", marker, colour if several else "white")

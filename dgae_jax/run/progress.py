@@ -1,4 +1,4 @@
-"""How a run is going: a live bar on a terminal, plain lines when piped."""
+"""How a run is going: a live bar on a terminal, a picture in a notebook, plain lines when piped."""
 
 import sys
 import time
@@ -7,6 +7,7 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn
 
 from dgae_jax.run import terminal
+from dgae_jax.run.notebook import Page
 
 PLAIN_EVERY = 10.0
 """Seconds between plain lines."""
@@ -15,8 +16,9 @@ PLAIN_EVERY = 10.0
 class Reporter:
     """Shows samples, samples per second over all seeds, the mean return, and the time left; or whatever else takes time."""
 
-    def __init__(self, total: int = 0, runs: int = 1):
-        self.total, self.runs = total, runs
+    def __init__(self, total: int = 0, runs: int = 1, page: Page | None = None):
+        """`page` takes the place of the lines."""
+        self.total, self.runs, self.page = total, runs, page
         self.printed = time.monotonic()
         self.bar = None
         if terminal.is_live():
@@ -31,13 +33,17 @@ class Reporter:
 
     def announce(self, text: str) -> None:
         """A line that is printed whatever was printed last; on a terminal the bar says it."""
-        if not self.bar:
+        if self.page:
+            self.page.show(text, at_once=True)
+        elif not self.bar:
             self.printed = time.monotonic()
             terminal.say(text)
 
     def watch(self, text: str) -> None:
         """What is going on: the bar's text, or a line every ten seconds."""
-        if self.bar:
+        if self.page:
+            self.page.show(text)
+        elif self.bar:
             self.bar.update(self.task, description=text)
         elif time.monotonic() - self.printed >= PLAIN_EVERY:
             self.announce(text)
@@ -52,9 +58,11 @@ class Reporter:
             self.bar.update(self.task, completed=steps)
         (self.announce if steps >= self.total and not self.bar else self.watch)(text)
 
-    def __exit__(self, *_) -> None:
+    def __exit__(self, kind: type[BaseException] | None, *_) -> None:
         if self.bar:
             self.bar.stop()
+        if self.page and kind is None:
+            self.page.show("", at_once=True)
 
 
 def clock(seconds: float) -> str:

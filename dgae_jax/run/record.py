@@ -9,12 +9,13 @@ from typing import Any
 
 import jax
 import numpy as np
+from matplotlib.figure import Figure
 
 from dgae_jax.configs.build import Fitted
 from dgae_jax.configs.config import Config
 from dgae_jax.learn.types import TrainState
 from dgae_jax.physics.engine import PhysicsState
-from dgae_jax.run import checkpoint, curve, hosts
+from dgae_jax.run import checkpoint, curve, hosts, notebook
 from dgae_jax.run.compiling import Watch
 from dgae_jax.run.evaluation import evaluate_policies
 from dgae_jax.run.evaluations import EvaluationsFile
@@ -37,6 +38,8 @@ class Record:
         self.evaluations = EvaluationsFile(run_dir / "evaluations.jsonl")
         self.evaluations.cut(done * config.samples_per_iteration, config.num_seeds)
         self.feed = Feed(options.log if hosts.is_first() else (), run_dir, config, self.steps)
+        self.page = notebook.Page(self.figure) if notebook.is_there() else None
+        """Where the learning curve is shown as it grows."""
         self.began = time.monotonic() - self.metrics.seconds
         self.beside, self.pending = ThreadPoolExecutor(1), Future()
         self.pending.set_result(None)
@@ -89,8 +92,16 @@ class Record:
 
     def draw(self) -> None:
         """The learning curve so far."""
+        self._write(_plot, self.run_dir / "curve.png", *self._curve())
+
+    def figure(self) -> Figure | None:
+        """The learning curve so far, None before the first return."""
+        data = self._curve()
+        return None if np.isnan(data[1]).all() else curve.learning_curve(*data)
+
+    def _curve(self) -> tuple[np.ndarray, np.ndarray, str, np.ndarray]:
         title = f"{self.config.task}, {self.config.algo}, {self.config.physics}"
-        self._write(_plot, self.run_dir / "curve.png", *self.metrics.curve(), title, self.evaluations.points())
+        return *self.metrics.curve(), title, self.evaluations.points()
 
     def _save_incidents(self, state: TrainState, seeds: set[int]) -> None:
         """Of every world that has turned non-finite the last state and action from which it did, per run: arrays by name."""

@@ -57,6 +57,11 @@ def silenced(quiet: bool = True) -> Iterator[None]:
         _silent.reset(token)
 
 
+def is_silent() -> bool:
+    """Whether nothing is to be said."""
+    return _silent.get()
+
+
 def is_live() -> bool:
     """Whether stdout is a terminal that someone may be looking at, and on which a line can be written again."""
     try:

@@ -94,7 +94,7 @@ def _iterate(config: Config, options: RunOptions, record: Record, signals: Signa
     if state is not None and done == config.iterations:
         return state
     trainer = make_trainer(make_task(config), CAPACITY, make_mesh((options.devices or 1) * jax.process_count()))
-    with Reporter(config.iterations * config.samples_per_iteration, config.num_seeds) as reporter:
+    with Reporter(config.iterations * config.samples_per_iteration, config.num_seeds, record.page) as reporter:
         resumed = state is not None
         state = _compiled(config, trainer, state, signals, reporter)
         if resumed and done % every == 0:
@@ -152,7 +152,7 @@ def _look(record: Record, state: TrainState, signals: Signals, reporter: Reporte
 
 def _evaluate(config: Config, options: RunOptions, record: Record, signals: Signals, state: TrainState) -> dict[str, Any]:
     """The evaluation at the end, which may take longer than a short training."""
-    with signals.may_stop(), Reporter() as reporter:
+    with signals.may_stop(), Reporter(page=record.page) as reporter:
         episodes = f"{options.episodes} episodes" + (f" of each of {config.num_seeds} seeds" if config.num_seeds > 1 else "")
         reporter.announce(f"evaluating {episodes} in {referee(config)} ({engines_of(config)[0]})")
         return record.evaluate(hosts.whole(policies_of(state)), reporter.watch)

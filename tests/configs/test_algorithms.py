@@ -1,16 +1,23 @@
 import itertools
+import json
+from functools import partial
 
+import flax.linen as nn
 import jax
 import jax.numpy as jnp
+import optax
 import pytest
 
 import dgae_jax as dg
 from dgae_jax.configs.algorithms import TABLE, Row
-from dgae_jax.configs.config import resolve
-from dgae_jax.configs.parts import CRITICS, DESCENT, RESIDUALS, TARGETS, UPDATES, Part
+from dgae_jax.configs.config import ConfigError, resolve
+from dgae_jax.configs.parts import COVARIANCES, CRITICS, DESCENT, OPTIMIZERS, RESIDUALS, TARGETS, UPDATES, Part
 from dgae_jax.configs.presets import PRESETS
+from dgae_jax.configs.serial import from_dict, to_dict
 from dgae_jax.configs.validation import validate
 from dgae_jax.envs.registry import TASKS
+from dgae_jax.learn import critics
+from dgae_jax.learn.networks import SharedCovariance
 from dgae_jax.learn.updates import descend, surrogate
 from tests.probes import Target
 
@@ -82,3 +89,56 @@ def test_a_seventh_row_joins_the_table_and_trains(monkeypatch):
     assert jnp.isfinite(metrics["policy/loss"])
     moved = jax.tree.map(lambda a, b: jnp.abs(a - b).max(), before.policy.params, after.policy.params)
     assert max(jax.tree.leaves(moved)) > 0
+
+
+class Swish(nn.Module):
+    """Hidden layers that are not tanh."""
+
+    hidden: tuple[int, ...]
+
+    @nn.compact
+    def __call__(self, x):
+        for width in self.hidden:
+            x = nn.swish(nn.Dense(width, name=f"wide_{width}")(x))
+        return x
+
+
+def test_networks_optimisers_and_targets_of_ones_own_are_chosen_by_name_and_used(monkeypatch):
+    one_step = critics.Target(lambda key, reward, discount, trace, z, z_next: reward[..., None] + 0 * z_next)
+    monkeypatch.setitem(COVARIANCES, "swish", Part(partial(SharedCovariance, torso=Swish)))
+    monkeypatch.setitem(CRITICS, "swish", Part(partial(critics.quantile, torso=Swish), CRITICS["quantile"].options))
+    monkeypatch.setitem(OPTIMIZERS, "lion", Part(optax.lion))
+    monkeypatch.setitem(TARGETS, "reward", Part(one_step))
+    policy = dg.PolicyConfig(hidden=(8,), covariance="swish", optimizer="lion", learning_rate=0.01, minibatches=1, epochs=1)
+    critic = dg.CriticConfig(hidden=(6, 5), kind="swish", target="reward", quantiles=4, minibatches=1)
+    config = dg.Config(
+        algo="dppo", num_envs=4, horizon=4, total_steps=64, policy=policy, critic=critic, metric="cvar:0.5", diagnostics=True
+    )
+    assert from_dict(json.loads(json.dumps(to_dict(config)))) == config
+    env = Target()
+    algorithm = dg.make_algorithm("dppo", env, config)
+    init, train_step = dg.make_train(algorithm, env, config)
+    before = jax.jit(init)(jax.random.key(0))
+    after, metrics = jax.jit(train_step)(before)
+    assert sorted(before.policy.params["params"]["Swish_0"]) == ["wide_8"]
+    assert sorted(before.critic.params["params"]["Swish_0"]) == ["wide_5", "wide_6"]
+    assert before.critic.params["params"]["Dense_0"]["kernel"].shape == (5, 4)
+    assert jnp.isfinite(metrics["critic/loss"])
+    moved = jnp.abs(after.policy.params["params"]["log_std"] - before.policy.params["params"]["log_std"])
+    assert jnp.allclose(moved, 0.01, rtol=1e-3)  # one step of Lion moves every number by the rate
+    reward = jnp.arange(6.0).reshape(3, 2)
+    assert (algorithm.critic.target(None, reward, reward, reward, None, jnp.ones((3, 2, 4))) == reward[..., None]).all()
+
+
+@pytest.mark.parametrize(
+    ("config", "message"),
+    [
+        (dg.Config(policy=dg.PolicyConfig(covariance="swish")), "policy.covariance swish: must be one of shared, state"),
+        (dg.Config(critic=dg.CriticConfig(kind="swish")), "critic.kind swish: must be one of scalar, quantile"),
+        (dg.Config(critic=dg.CriticConfig(target="reward")), "critic.target reward: must be one of bellman, "),
+        (dg.Config(policy=dg.PolicyConfig(optimizer="lion")), "policy.optimizer lion: must be one of adam, rmsprop"),
+    ],
+)
+def test_a_part_that_is_not_in_its_table_is_refused_by_name(config, message):
+    with pytest.raises(ConfigError, match=f"^{message}"):
+        validate(config)
