@@ -108,7 +108,9 @@ def test_a_variant_takes_the_place_of_the_algorithm_in_the_name_of_a_cell():
 
 def test_every_variant_of_a_question_is_a_configuration_of_its_own():
     for question in VARIANTS:
-        arguments, rest = parse_known(reproduce.Arguments, "", ["study", "--variants", question, "--envs", "hopper", "--seeds", "0"], rest=reproduce.REST)
+        arguments, rest = parse_known(
+            reproduce.Arguments, "", ["study", "--variants", question, "--envs", "hopper", "--seeds", "0"], rest=reproduce.REST
+        )
         found, _ = reproduce._cells(arguments, rest)
         assert [cell.kind for cell in found] == list(VARIANTS[question])
         assert len({json.dumps(to_dict(cell.config)) for cell in found}) == len(found)
