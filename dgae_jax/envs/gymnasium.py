@@ -66,7 +66,8 @@ class _Worlds:
     """The worlds of one environment, as many as a call is for; the i-th of a call is the i-th here."""
 
     def __init__(self, make: Callable[[], gymnasium.Env], first: gymnasium.Env):
-        self.make, self.worlds, self.at = make, [first], [_NOWHERE]
+        self.make, self.worlds = make, [first]
+        self.at: list[tuple[int, int]] = [_NOWHERE]
 
     def reset(self, before: Sequence[np.ndarray], after: Sequence[np.ndarray]) -> None:
         """Begin an episode with the seed [..., 2] where it is `needed` [...]; its observation [..., O], or zeros."""

@@ -85,6 +85,6 @@ def make(name: str, physics: str, version: None, **parameters) -> Env:
             raise ValueError(f"Playground has no {name}, but {', '.join(near)}")
         if name not in dm_control_suite.ALL_ENVS and not MENAGERIE_PATH.exists():
             raise ValueError(f"its robot is in mujoco_menagerie, which Playground looks for in {MENAGERIE_PATH} and would download")
-        config = registry.get_default_config(name)
+        config: Any = registry.get_default_config(name)
         env = registry.load(name, config_overrides={"impl": IMPL[physics], **parameters})
     return PlaygroundTask(env, physics, config.episode_length, config.action_repeat)

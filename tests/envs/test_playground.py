@@ -28,7 +28,7 @@ def test_a_task_whose_robot_would_be_downloaded_is_refused(monkeypatch, tmp_path
 
     monkeypatch.setattr(mjx_env, "MENAGERIE_PATH", tmp_path / "mujoco_menagerie")
     monkeypatch.setattr(mjx_env, "ensure_menagerie_exists", lambda: pytest.fail("a download"))
-    with pytest.raises(ValueError, match="its robot is in mujoco_menagerie, which Playground looks for in .* and would download"):
+    with pytest.raises(ValueError, match=r"its robot is in mujoco_menagerie, which Playground looks for in .* and would download"):
         dg.make_env("playground:Go1Getup")
 
 

@@ -45,6 +45,7 @@ def test_a_task_of_gymnasiums_is_evaluated_there_with_the_shorter_of_two_time_li
     assert [time_limit(dataclasses.replace(PENDULUM, episode_length=n)) for n in (20, 1000)] == [20, 200]
 
 
+@pytest.mark.slow
 def test_a_run_on_an_object_is_a_whole_run_and_needs_the_object_again(tmp_path):
     run = dg.train(given(episode_length=20), tmp_path / "run", env=Counter(), **CHOSEN)
     assert run.evaluation["env"] == "custom:Counter"
