@@ -14,7 +14,7 @@ from dgae_jax.configs.build import Fitted
 from dgae_jax.configs.config import Config
 from dgae_jax.learn.types import TrainState
 from dgae_jax.physics.engine import PhysicsState
-from dgae_jax.run import checkpoint, curve, hosts
+from dgae_jax.run import checkpoint, hosts
 from dgae_jax.run.compiling import Watch
 from dgae_jax.run.evaluation import evaluate_policies
 from dgae_jax.run.evaluations import EvaluationsFile
@@ -106,5 +106,7 @@ class Record:
 
 
 def _plot(path: Path, *data) -> None:
+    from dgae_jax.run import curve  # Matplotlib takes a second to load, which training does not wait for
+
     curve.save(curve.learning_curve(*data), path)
     gc.collect()  # a figure is full of cycles, and left alone figures gather: 3 MB each
