@@ -40,24 +40,31 @@ complete -o filenames -F _dgae dgae
 """What is added to tyro's script: run directories, which stand without a flag, are completed where no flag begins so."""
 
 
+_SPLIT = ('COMPREPLY=($(compgen -f -- "$cur"))', 'mapfile -t COMPREPLY < <(compgen -f -- "$cur")')
+"""Where tyro's script for bash takes a name with a space for two, and how it is one."""
+
+
 def script(shell: str, commands: dict[str, str]) -> str:
     """The completion of `dgae` with these commands and what each is for; raises ConfigError for an unknown shell."""
     if shell not in FILES:
         raise invalid("completion", shell or "nothing", f"one of {', '.join(FILES)}")
-    kinds = [Annotated[_shown(name), tyro.conf.subcommand(name, description=purpose)] for name, purpose in commands.items()]
+    kinds = [
+        Annotated[view(map(_with_choices, leaves_of(name))), tyro.conf.subcommand(name, description=purpose)]
+        for name, purpose in commands.items()
+    ]
     either: Any = Union[tuple(kinds)]  # noqa: UP007
     screen = io.StringIO()
     with contextlib.redirect_stdout(screen), contextlib.suppress(SystemExit):
         tyro.cli(either, prog="dgae", args=["--tyro-print-completion", shell])
-    return screen.getvalue() + FILES[shell]
+    return screen.getvalue().replace(*_SPLIT) + FILES[shell]
 
 
-def _shown(name: str) -> type:
+def leaves_of(name: str) -> list[Leaf]:
     """What a command parses, and what it leaves to dgae train to parse."""
     module = import_module(f"dgae_jax.cli.{name}")
     ours = {leaf.flag: leaf for leaf in leaves(module.Arguments)}
     theirs = {leaf.flag: leaf for cls in getattr(module, "REST", ()) for leaf in leaves(cls)}
-    return view(map(_with_choices, (theirs | ours).values()))
+    return list((theirs | ours).values())
 
 
 def _with_choices(leaf: Leaf) -> Leaf:

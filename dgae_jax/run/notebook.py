@@ -6,11 +6,12 @@ import io
 import sys
 import time
 from collections.abc import Callable
-from typing import Any
-
-from matplotlib.figure import Figure
+from typing import TYPE_CHECKING, Any
 
 from dgae_jax.run import terminal
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 EVERY = 4.0
 """Least seconds between two pictures; drawing never takes more than a tenth of the time either."""
@@ -29,7 +30,7 @@ def is_there() -> bool:
 class Page:
     """Words until there is something to draw, then the picture with the words in it."""
 
-    def __init__(self, draw: Callable[[], Figure | None]):
+    def __init__(self, draw: "Callable[[], Figure | None]"):
         """`draw` makes the picture as it is now, None while there is nothing to see."""
         self.draw, self.shown, self.due = draw, None, 0.0
 
@@ -52,7 +53,7 @@ class Page:
             self.shown.update(data, raw=True, metadata=metadata)
 
 
-def _picture(figure: Figure, words: str) -> tuple[dict[str, Any], dict[str, Any]]:
+def _picture(figure: "Figure", words: str) -> tuple[dict[str, Any], dict[str, Any]]:
     """A PNG and how wide it is shown."""
     axes = figure.axes[0]
     title = axes.get_title()
@@ -60,6 +61,6 @@ def _picture(figure: Figure, words: str) -> tuple[dict[str, Any], dict[str, Any]
         axes.set_title(f"{title}\n{words}", fontsize=9)
     image = io.BytesIO()
     figure.savefig(image, format="png")
-    gc.collect()  # see record.draw
+    gc.collect()  # see record._plot
     png = base64.b64encode(image.getvalue()).decode()
     return {"image/png": png, "text/plain": f"{title} {words}".strip()}, {"image/png": {"width": WIDTH}}

@@ -5,17 +5,16 @@ import time
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import jax
 import numpy as np
-from matplotlib.figure import Figure
 
 from dgae_jax.configs.build import Fitted
 from dgae_jax.configs.config import Config
 from dgae_jax.learn.types import TrainState
 from dgae_jax.physics.engine import PhysicsState
-from dgae_jax.run import checkpoint, curve, hosts, notebook
+from dgae_jax.run import checkpoint, hosts, notebook
 from dgae_jax.run.compiling import Watch
 from dgae_jax.run.evaluation import evaluate_policies
 from dgae_jax.run.evaluations import EvaluationsFile
@@ -23,6 +22,9 @@ from dgae_jax.run.metrics import MetricsFile
 from dgae_jax.run.options import RunOptions
 from dgae_jax.run.signals import Stopped
 from dgae_jax.run.sinks.feed import Feed
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 
 class Record:
@@ -94,10 +96,10 @@ class Record:
         """The learning curve so far."""
         self._write(_plot, self.run_dir / "curve.png", *self._curve())
 
-    def figure(self) -> Figure | None:
+    def figure(self) -> "Figure | None":
         """The learning curve so far, None before the first return."""
         data = self._curve()
-        return None if np.isnan(data[1]).all() else curve.learning_curve(*data)
+        return None if np.isnan(data[1]).all() else _curve_module().learning_curve(*data)
 
     def _curve(self) -> tuple[np.ndarray, np.ndarray, str, np.ndarray]:
         title = f"{self.config.task}, {self.config.algo}, {self.config.physics}"
@@ -116,6 +118,14 @@ class Record:
             np.savez(directory / f"steps_{self.steps:012d}_seed_{seed}.npz", world=worlds, **arrays, action=action)
 
 
+def _curve_module() -> Any:
+    """Matplotlib takes a second to load, which training does not wait for."""
+    from dgae_jax.run import curve
+
+    return curve
+
+
 def _plot(path: Path, *data) -> None:
+    curve = _curve_module()
     curve.save(curve.learning_curve(*data), path)
     gc.collect()  # a figure is full of cycles, and left alone figures gather: 3 MB each
