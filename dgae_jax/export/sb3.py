@@ -54,7 +54,7 @@ class Sb3VecEnv(VecEnv):
         """Close the environment."""
         self.env.close()
 
-    def get_images(self) -> list[np.ndarray]:
+    def get_images(self) -> list[Any]:
         """A picture of each world."""
         return list(self.env.render() or ())
 

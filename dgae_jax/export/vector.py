@@ -5,7 +5,6 @@ Importing this registers them with Gymnasium: `gymnasium.make_vec("dgae_jax.expo
 
 from collections.abc import Iterable
 from functools import partial
-from numbers import Integral
 from typing import Any
 
 import gymnasium
@@ -45,13 +44,14 @@ class VectorTask(VectorEnv):
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
         self._renew = jax.jit(partial(renew, env))
+        self._place = jax.jit(jax.vmap(lambda state, qpos, qvel: env.set_state(state, qpos, qvel)))
         self._advance = jax.jit(partial(MODES[mode.value], env, limit))
         self._worlds: Worlds | None = None
         self._seeds: list[int | None] = [None] * num_envs
         self._stage: Stage | None = None
 
     @property
-    def np_random_seed(self) -> tuple[int | None, ...]:
+    def np_random_seed(self) -> tuple[int | None, ...]:  # pyright: ignore[reportIncompatibleMethodOverride] as SyncVectorEnv's
         """What each world was last seeded with; None before its first reset."""
         return tuple(self._seeds)
 
@@ -63,7 +63,7 @@ class VectorTask(VectorEnv):
     def set_state(self, qpos: Float[ArrayLike, "N Q"], qvel: Float[ArrayLike, "N V"]) -> Float[np.ndarray, "N O"]:
         """Move every world to a pose, as Gymnasium's `set_state`, and return the observations; for our own tasks."""
         worlds = self._ready()
-        self._worlds = worlds._replace(state=jax.jit(jax.vmap(self.env.set_state))(worlds.state, qpos, qvel))
+        self._worlds = worlds._replace(state=self._place(worlds.state, np.asarray(qpos), np.asarray(qvel)))
         return self._observations()
 
     def reset(self, *, seed: Seeds = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, dict[str, Any]]:
@@ -76,7 +76,7 @@ class VectorTask(VectorEnv):
         if self._worlds is None:
             if not mask.all():
                 raise ResetNeeded("the first reset is one of all worlds: reset_mask leaves some out")
-            drawn = self.np_random.integers(2**63, size=self.num_envs) if None in seeds else seeds
+            drawn = self.np_random.integers(2**63, size=self.num_envs)
             seeds = [int(d) if s is None else s for s, d in zip(seeds, drawn, strict=True)]
             self._worlds = blank(self.env, keys_of([0] * self.num_envs))
         given = mask & [s is not None for s in seeds]
@@ -133,10 +133,13 @@ class VectorTask(VectorEnv):
 
 def _seeds(seed: Seeds, count: int) -> list[int | None]:
     """One for each world, None where it is to go on as it is."""
-    numbers = [seed if seed is None else seed + i for i in range(count)] if seed is None or isinstance(seed, Integral) else list(seed)
-    if len(numbers) != count or any(n is not None and not (isinstance(n, Integral) and n >= 0) for n in numbers):
+    if seed is None or isinstance(seed, int | np.integer):
+        seeds = [None if seed is None else int(seed) + i for i in range(count)]
+    else:
+        seeds = list(seed)
+    if len(seeds) != count or any(s is not None and not (isinstance(s, int | np.integer) and s >= 0) for s in seeds):
         raise invalid("seed", seed, f"a number of at least 0, or {count} of them, None where a world goes on as it is")
-    return [None if n is None else int(n) for n in numbers]
+    return [None if s is None else int(s) for s in seeds]
 
 
 def _reset_mask(options: dict[str, Any], count: int) -> Bool[np.ndarray, " N"]:
@@ -179,11 +182,11 @@ def make_vector_env(
     `render_mode` "rgb_array" is for our own tasks. Raises ValueError, naming what is allowed, as `make_env` and for these.
     """
     modes = {mode.value: mode for mode in AutoresetMode}
-    mode = modes.get(getattr(autoreset_mode, "value", autoreset_mode))
+    mode = modes.get(str(getattr(autoreset_mode, "value", autoreset_mode)))
     if mode is None:
         raise invalid("autoreset_mode", autoreset_mode, f"one of {', '.join(modes)}")
     for setting, value in {"num_envs": num_envs, "max_episode_steps": max_episode_steps}.items():
-        if not isinstance(value, Integral) or value < 1:
+        if not isinstance(value, int | np.integer) or value < 1:
             raise invalid(setting, value, "a whole number of at least 1")
     if render_mode is not None and (render_mode != "rgb_array" or name not in CAMERAS):
         raise invalid("render_mode", render_mode, f"left out, or rgb_array with {', '.join(CAMERAS)}")

