@@ -35,7 +35,7 @@ def test_a_task_whose_robot_would_be_downloaded_is_refused(monkeypatch, tmp_path
 def test_parameters_override_the_tasks_configuration(key):
     env = dg.make_env("playground:CartpoleBalance", episode_length=7)
     assert env._env.episode_length == 7
-    with pytest.raises(ValueError, match="its configuration is .*episode_length.*: .*wheels"):
+    with pytest.raises(ValueError, match=r"its configuration is .*episode_length.*: .*wheels"):
         dg.make_env("playground:CartpoleBalance", wheels=3)
 
 
