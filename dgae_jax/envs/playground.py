@@ -86,5 +86,9 @@ def make(name: str, physics: str, version: None, **parameters) -> Env:
         if name not in dm_control_suite.ALL_ENVS and not MENAGERIE_PATH.exists():
             raise ValueError(f"its robot is in mujoco_menagerie, which Playground looks for in {MENAGERIE_PATH} and would download")
         config: Any = registry.get_default_config(name)
-        env = registry.load(name, config_overrides={"impl": IMPL[physics], **parameters})
+        try:
+            config.update_from_flattened_dict({"impl": IMPL[physics], **parameters})
+        except (AttributeError, KeyError, TypeError) as reason:
+            raise ValueError(f"its configuration is {', '.join(config)}: {reason}") from reason
+        env = registry.load(name, config)
     return PlaygroundTask(env, physics, config.episode_length, config.action_repeat)

@@ -73,13 +73,15 @@ def _record(episodes: Episodes, attempt: Any, valid: Bool[Array, " N"]) -> Episo
     return episodes._replace(nonfinite=episodes.nonfinite + ~valid, incident=where(valid, episodes.incident, attempt))
 
 
-def _ends(state: Any) -> tuple[Bool[Array, " N"], Bool[Array, " N"] | bool]:
-    """Which worlds the task ended, and which it cut short: those that are done with `truncation` in `info`, as Brax has it."""
+def _ends(state: Any, late: Bool[Array, " N"]) -> tuple[Bool[Array, " N"], Bool[Array, " N"]]:
+    """Which worlds the task ended, and which were cut short: those that are `late`, and those that the task says are done with
+    `truncation` in `info`, as Brax has it.
+    """
     done = state.done > 0
     if "truncation" not in state.info:
-        return done, False
+        return done, late
     cut = done & (state.info["truncation"] > 0)
-    return done & ~cut, cut
+    return done & ~cut, cut | late
 
 
 def _advance(episodes: Episodes, after: Any, step: Transition, fresh: Episodes) -> Episodes:
@@ -112,9 +114,9 @@ def rollout(env: Env, act: Act, episodes: Episodes, keys: Key[Array, "T N"], *, 
         action, log_prob = act(act_keys, before.obs)
         after = jax.vmap(env.step)(before, jnp.clip(action, low, high))
         valid = finite((before.obs, action, log_prob, after.pipeline_state, after.reward, after.obs, after.done))
-        over, cut = _ends(after)
+        over, cut = _ends(after, episodes.steps + 1 >= episode_length)
         terminated = over | ~valid
-        truncated = ~terminated & (cut | (episodes.steps + 1 >= episode_length))
+        truncated = ~terminated & cut
         step = Transition(before.obs, action, log_prob, after.reward, terminated, truncated, after.obs, valid)  # pyright: ignore[reportArgumentType]
         step = _quarantine(step, valid)
         episodes = _record(episodes, (before.pipeline_state, action), valid)

@@ -32,6 +32,13 @@ def test_a_task_whose_robot_would_be_downloaded_is_refused(monkeypatch, tmp_path
         dg.make_env("playground:Go1Getup")
 
 
+def test_parameters_override_the_tasks_configuration(key):
+    env = dg.make_env("playground:CartpoleBalance", episode_length=7)
+    assert env._env.episode_length == 7
+    with pytest.raises(ValueError, match=r"its configuration is .*episode_length.*: .*wheels"):
+        dg.make_env("playground:CartpoleBalance", wheels=3)
+
+
 def test_a_task_is_playgrounds_own_with_its_time_limit_as_a_truncation(key):
     from mujoco_playground import registry
 
