@@ -61,6 +61,7 @@ def test_links_lead_to_a_file_and_a_heading_of_it(path):
         name, _, anchor = target.partition("#")
         file = path.parent / name if name else path
         assert file.exists(), target
+        assert path.parent != ROOT / "docs" or not name.startswith(".."), f"{target} is not in the site"
         assert not anchor or anchor in anchors(file), target
 
 
