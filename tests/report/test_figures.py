@@ -8,7 +8,8 @@ import pytest
 from matplotlib.colors import to_hex
 from matplotlib.image import imread
 
-from dgae_jax.configs.algorithms import TABLE
+from dgae_jax.configs.algorithms import TABLE, Row
+from dgae_jax.configs.parts import CRITICS, UPDATES
 from dgae_jax.report import analysis, figures
 from dgae_jax.report.published import Published
 from dgae_jax.report.style import look
@@ -21,6 +22,17 @@ def test_a_pair_of_algorithms_has_one_colour_and_the_scalar_one_is_dashed():
     assert len({each.colour for each in looks.values()}) == 3
     assert {name for name, each in looks.items() if each.line == "--"} == {"ppo", "trpo", "a2c"}
     assert {each.line for each in looks.values()} == {"-", "--"}
+
+
+def test_rows_of_ones_own_have_a_marker_or_a_colour_that_no_other_has(monkeypatch):
+    monkeypatch.setitem(CRITICS, "wide", CRITICS["quantile"])
+    monkeypatch.setitem(UPDATES, "careful", UPDATES["clip"])
+    monkeypatch.setitem(TABLE, "target", Row("quantile", "distributional", "lambda-return", "clip"))
+    monkeypatch.setitem(TABLE, "network", Row("wide", "distributional", "sr-lambda", "clip"))
+    monkeypatch.setitem(TABLE, "update", Row("scalar", "td", "lambda-return", "careful"))
+    assert len({look(algo) for algo in TABLE}) == 9
+    assert [look(algo).colour == look("dppo").colour for algo in ("target", "network", "update")] == [True, True, False]
+    assert [look(algo).line for algo in ("target", "network", "update")] == ["-", "-", "--"]
 
 
 def test_learning_curves_are_mean_and_standard_deviation_over_seeds(grouped):
