@@ -87,6 +87,8 @@ def _cells(arguments: Arguments, rest: list[str]) -> tuple[list[matrix.Cell], Ru
         given = getattr(arguments, name)
         if not given or len(set(given)) < len(given):
             raise invalid(name, given, "at least one, each once")
+    if not all(0 <= seed < 2**32 for seed in arguments.seeds):
+        raise invalid("seeds", arguments.seeds, f"whole numbers from 0 to {2**32 - 1:,}")
     if not 0 < arguments.scale <= 1:
         raise invalid("scale", arguments.scale, "above 0 and at most 1")
     if not 1 <= arguments.seeds_per_run <= len(arguments.seeds):

@@ -65,6 +65,8 @@ def parsed(argv: list[str]) -> tuple[Config, RunOptions]:
     """The configuration in full and the options that a command line means; raises ConfigError for the first that is invalid."""
     argv = understood(argv)
     given = peek(argv, "preset", "config", "resume", "algo", "env", "policy.update", "critic.kind")
+    for name in (name for name, value in given.items() if value == ""):
+        raise ConfigError(f"{name}: must be followed by a value", name)
     config = _start(given)
     options = manifest.options(Path(given["resume"])) if given["resume"] else RunOptions()
     arguments = parse(Arguments, PURPOSE, argv, Arguments(settings=config, run=options), EXAMPLES, NOTE)
