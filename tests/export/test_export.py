@@ -89,7 +89,7 @@ def test_each_seed_and_each_checkpoint_has_its_own_weights(run_dir, run, tmp_pat
     ("argv", "message"),
     [
         (["nowhere", "--to", "npz"], r"nowhere/config\.json: must be a configuration that can be read \(No such file or directory\)"),
-        (["RUN", "--to", "tflite"], r"'tflite'.*--to"),
+        (["RUN", "--to", "tflite"], r"--to tflite: must be one of npz, onnx, gymnasium"),
         (["RUN"], r"--to"),
         (["RUN", "--to"], r"--to"),
         (["RUN", "--to", "npz", "--checkpoint", "last"], r"--checkpoint last: must be one of"),
