@@ -143,10 +143,10 @@ def test_the_scale_of_rewards_is_that_of_the_training_state(distributional):
         ([".", "--width", "481"], r"--width 481: must be an even number from 160 to 1,920"),
         ([".", "--seconds", "0"], r"--seconds 0\.0: must be a number above 0, up to 600"),
         ([".", "--seconds", "nan"], r"--seconds nan: must be a number above 0, up to 600"),
-        ([".", "--format", "avi"], r"'avi' for argument '--format'"),
+        ([".", "--format", "avi"], r"--format avi: must be one of"),
         ([".", "--during", "--compare", "a"], r"--compare a: must be left out with --during"),
         ([".", "--during", "--checkpoint", "best"], r"--checkpoint best: must be left out with --during"),
-        ([".", "--checkpoint", "last"], r"'last' for argument '--checkpoint'"),
+        ([".", "--checkpoint", "last"], r"--checkpoint last: must be one of"),
     ],
 )
 def test_render_refuses_bad_input_in_one_line(argv, message, run, monkeypatch, tmp_path):
