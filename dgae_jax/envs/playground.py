@@ -85,7 +85,7 @@ def make(name: str, physics: str, version: None, **parameters) -> Env:
             raise ValueError(f"Playground has no {name}, but {', '.join(near)}")
         if name not in dm_control_suite.ALL_ENVS and not MENAGERIE_PATH.exists():
             raise ValueError(f"its robot is in mujoco_menagerie, which Playground looks for in {MENAGERIE_PATH} and would download")
-        config: Any = registry.get_default_config(name)
+        config: Any = registry.get_default_config(name).lock()  # with a new name it is a mistake
         try:
             config.update_from_flattened_dict({"impl": IMPL[physics], **parameters})
         except (AttributeError, KeyError, TypeError) as reason:
