@@ -29,7 +29,8 @@ def sentence(box: str, listed: Sequence[Leaf], argv: Sequence[str]) -> str:
         needed = next(leaf for leaf in listed if leaf.default is MISSING and (_upper(leaf.flag) if leaf.positional else leaf.flag) in text)
         return f"{_upper(needed.flag) if needed.positional else '--' + needed.flag}: must be given"
     if found := re.search(r"for argument '(\S+)'\. Expected one of \((.*?),?\)", text):
-        return f"{found[1]} {' '.join(_values(found[1], argv))}: must be one of {found[2].replace(chr(39), '')}"
+        allowed = ", ".join(name for name in re.findall(r"'(.*?)'", found[2]) if name != "None")
+        return f"{found[1]} {' '.join(_values(found[1], argv))}: must be one of {allowed}"
     if (found := re.match(r"Error parsing (\S+):", text)) and (kind := KINDS.get(metavar(by_flag[found[1]].hint) or "")):
         return f"{found[1]} {' '.join(_values(found[1], argv))}: must be {kind}"
     return text

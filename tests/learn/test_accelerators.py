@@ -12,7 +12,9 @@ from tests.helpers import small
 
 
 @pytest.mark.parametrize("physics", ["jax", "mjx"])
-@pytest.mark.parametrize("algo", ["ppo", "dppo", "trpo", "dtrpo", "a2c", "da2c"])
+@pytest.mark.parametrize(
+    "algo", ["dppo", "dtrpo", "da2c", *(pytest.param(name, marks=pytest.mark.slow) for name in ("ppo", "trpo", "a2c"))]
+)
 def test_the_training_step_lowers_for_cuda_and_tpu_without_a_call_to_the_host(algo, physics):
     config, env = dataclasses.replace(small(algo), physics=physics), dg.make_env("hopper", physics=physics)
     init, step = dg.make_train(dg.make_algorithm(algo, env, config), env, config)

@@ -23,6 +23,7 @@ def found(tmp_path_factory):
     return np.load(file)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("count", [2, 4])
 @pytest.mark.parametrize("algo", ["dppo", "dtrpo"])
 def test_after_ten_iterations_the_networks_are_those_of_one_device_up_to_rounding(algo, count, found):
@@ -31,11 +32,13 @@ def test_after_ten_iterations_the_networks_are_those_of_one_device_up_to_roundin
     assert np.abs(found[f"{algo} 1"] - found[f"{algo} start"]).max() > 1e-3
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("algo", ["dppo", "dtrpo"])
 def test_devices_that_share_each_minibatch_as_accelerators_do_find_the_same(algo, found):
     assert_allclose(found[f"{algo} gradients"], found[f"{algo} 1"], atol=1e-5)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seeds", [4, 3])
 def test_seeds_are_divided_between_devices_or_their_worlds_are_and_find_the_same(seeds, found):
     assert_allclose(found[f"{seeds} seeds 4"], found[f"{seeds} seeds 1"], atol=1e-5)

@@ -100,7 +100,7 @@ def test_a_policy_does_what_evaluations_play(finished, monkeypatch):
         return seen[-1][1]
 
     watched.lower = greedy.lower
-    monkeypatch.setattr("dgae_jax.run.evaluation._greedy", lambda _: watched)
+    monkeypatch.setattr("dgae_jax.run.evaluation._greedy", lambda *_: watched)
     evaluate_policies(policies, config, episodes=4)
     policy = load_policy(finished)
     assert len(seen) > 5

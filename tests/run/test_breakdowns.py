@@ -19,7 +19,14 @@ from tests.runs import QUIET, SMALL, last, small, timeless
 
 
 @pytest.mark.parametrize("evaluation", [1, 2])
-@pytest.mark.parametrize(("kind", "code"), [(signal.SIGTERM, 143), (signal.SIGINT, 130), (signal.SIGHUP, 129)])
+@pytest.mark.parametrize(
+    ("kind", "code"),
+    [
+        (signal.SIGTERM, 143),
+        pytest.param(signal.SIGINT, 130, marks=pytest.mark.slow),
+        pytest.param(signal.SIGHUP, 129, marks=pytest.mark.slow),
+    ],
+)
 def test_a_signal_in_an_evaluation_breaks_it_off_and_the_run_goes_on_later_to_the_same_end(
     kind, code, evaluation, finished, tmp_path, capsys
 ):

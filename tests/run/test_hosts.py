@@ -61,6 +61,7 @@ def test_two_processes_find_what_one_finds_with_two_devices(whole, tmp_path):
     np.testing.assert_allclose(*returns, rtol=1e-5)
 
 
+@pytest.mark.slow
 def test_a_run_of_two_processes_goes_on_bit_for_bit(whole, tmp_path):
     half = tmp_path / "half"
     stopped_half_way(whole, half)

@@ -25,7 +25,9 @@ def table(title):
 METRICS, EVALUATIONS = table("metrics.jsonl"), table("evaluations.jsonl")
 
 
-@pytest.fixture(scope="module", params=TABLE)
+@pytest.fixture(
+    scope="module", params=[name if name in ("dppo", "dtrpo", "a2c") else pytest.param(name, marks=pytest.mark.slow) for name in TABLE]
+)
 def run(request, tmp_path_factory):
     """The configuration of a tiny run with all that it can say, its metrics and its evaluations."""
     config = small(request.param)

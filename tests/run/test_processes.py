@@ -78,7 +78,14 @@ def test_a_signal_saves_within_half_a_minute_and_a_second_one_ends_at_once(kind,
     assert int(state.iteration[0]) >= 1
 
 
-@pytest.mark.parametrize(("kind", "code"), [(signal.SIGTERM, 143), (signal.SIGINT, 130), (signal.SIGHUP, 129)])
+@pytest.mark.parametrize(
+    ("kind", "code"),
+    [
+        (signal.SIGTERM, 143),
+        pytest.param(signal.SIGINT, 130, marks=pytest.mark.slow),
+        pytest.param(signal.SIGHUP, 129, marks=pytest.mark.slow),
+    ],
+)
 def test_a_signal_while_it_compiles_ends_it_at_once(kind, code, tmp_path):
     layers = ["8"] * 32  # half a minute of compilation
     argv = [

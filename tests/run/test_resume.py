@@ -86,6 +86,7 @@ def test_another_machine_or_version_is_refused_by_both_values_unless_asked_for_a
     assert resume(small(), dataclasses.replace(QUIET, resume=run_dir)) == 0  # where it was last
 
 
+@pytest.mark.slow
 def test_physics_may_change_if_asked_for_with_a_warning_that_names_the_tolerance(run_dir, capsys):
     other = dataclasses.replace(small("ppo", "jax"), total_steps=9 * 64)
     assert resume(other, dataclasses.replace(QUIET, resume=run_dir, inexact=True)) == 0

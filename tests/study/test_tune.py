@@ -145,6 +145,7 @@ def test_the_page_is_one_file_whose_pictures_have_words(tuned):
     assert (tuned[0] / "history.png").read_bytes().startswith(b"\x89PNG")
 
 
+@pytest.mark.slow
 def test_a_tuning_that_is_over_is_reported_again_and_more_trials_go_on_from_it(tuned):
     study, _ = tuned
     before = table_of(study)
@@ -200,6 +201,7 @@ def test_a_signal_stops_it_with_its_exit_code_and_the_same_command_goes_on_where
     assert [path.name for path in sorted((study / "trials").iterdir())] == ["0000", "0002"]
 
 
+@pytest.mark.slow
 def test_machines_without_a_common_disk_share_a_study_in_postgresql(postgres, tmp_path):
     places = [tmp_path / machine / "shared" for machine in ("one", "two")]
     processes = [start(place, "--storage", postgres, "--trials", "4", "--workers", "1") for place in places]
@@ -216,6 +218,7 @@ def test_machines_without_a_common_disk_share_a_study_in_postgresql(postgres, tm
 
 
 @pytest.mark.slow
+@pytest.mark.slow
 def test_a_process_that_is_killed_is_made_up_for_through_postgresql_too(postgres, tmp_path):
     slow = dataclasses.replace(small(), total_steps=64 * 200)
     url = postgres.replace("postgresql:", "postgresql+psycopg:")
@@ -231,6 +234,7 @@ def test_a_process_that_is_killed_is_made_up_for_through_postgresql_too(postgres
     storage.engine.dispose()
 
 
+@pytest.mark.slow
 def test_trials_side_by_side_are_worth_what_they_are_alone(tmp_path):
     ours = tuning(tmp_path / "study", side_by_side=3, seeds=2)
     _, study = opened(ours)
