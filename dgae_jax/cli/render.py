@@ -34,7 +34,7 @@ class Arguments:
     run_dir: tyro.conf.Positional[Path]
     """Directory of the run [path]."""
     compare: tuple[Path, ...] = ()
-    """Further runs, shown beside it from the same initial states [paths]."""
+    """Further runs from the same initial states, shown beside it, from four on in a square [paths]."""
     checkpoint: Literal["newest", "best"] | None = None
     """newest, or best: of the evaluations while it trained; by default newest."""
     during: bool = False

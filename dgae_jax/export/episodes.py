@@ -16,10 +16,8 @@ from dgae_jax.maths.risk import weights_of
 from dgae_jax.maths.transport import directional_metric
 from dgae_jax.run import restore
 from dgae_jax.run.api import Policy
+from dgae_jax.run.calibration import LONGEST, steps_that_count
 from dgae_jax.run.evaluation import episode_seeds, referee
-
-LEFT_OUT = 0.01
-"""Weight γᵏ of the first reward that the return from a state on leaves out: an episode is played on until then."""
 
 
 class Actor(NamedTuple):
@@ -92,12 +90,11 @@ def play(actor: Actor, number: int, seconds: float) -> Episode:
     """The episode that Gymnasium begins with the seed `number`, up to its time limit or `seconds`.
 
     What is shown ends there; the episode goes on unseen until further rewards do not count in the return from the last state
-    shown (`LEFT_OUT`), or the robot falls.
+    shown (`steps_that_count`), or the robot falls.
     """
     config, world = actor.config, _world(actor.config)
     shown = min(config.episode_length, max(1, math.floor(seconds / world.unwrapped.dt)))
-    longest = shown + sum(config.gamma**k > LEFT_OUT for k in range(config.episode_length))
-    states, rewards, fell = _steps(world, actor.policy, number, longest)
+    states, rewards, fell = _steps(world, actor.policy, number, shown + steps_that_count(config.gamma))
     observed, qpos, qvel = (np.stack(part[:shown]) for part in zip(*states, strict=True))
     quantiles = np.sort(actor.policy.quantiles(observed))
     weights = weights_of(config.metric, quantiles.shape[-1])
@@ -127,7 +124,7 @@ def _world(config: Config) -> Any:
 
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # that v4 is not the newest version is known
-        return gymnasium.make(referee(config), max_episode_steps=2 * config.episode_length)
+        return gymnasium.make(referee(config), max_episode_steps=config.episode_length + LONGEST)
 
 
 def _steps(world: Any, policy: Callable[[Any], np.ndarray], number: int, longest: int) -> tuple[list[tuple], list[float], bool]:

@@ -1,5 +1,6 @@
 """From episodes to the frames of a film: robots side by side, each over its strip."""
 
+import math
 from collections.abc import Iterable, Iterator
 from contextlib import ExitStack
 from itertools import zip_longest
@@ -15,6 +16,9 @@ from dgae_jax.run.compiling import Watch, unwatched
 
 HOLD = 0.6
 """Seconds for which the last frame of an episode stands."""
+
+IN_A_ROW = 3
+"""Most robots in one row; more are arranged in a square."""
 
 SAY_EVERY = 25
 """Frames between words on how far the film is."""
@@ -53,13 +57,21 @@ def shown(states: int, dt: float, fps: float) -> list[int]:
 
 
 def side_by_side(columns: list[Iterator[Frame]], hold: int) -> Iterator[Frame]:
-    """One frame of each column in a row; a column that has ended stands still, and so do all for `hold` frames at the end."""
+    """One frame of each column; a column that has ended stands still, and so do all for `hold` frames at the end."""
     last: list[Frame] = []
     for row in zip_longest(*columns):
         last = [new if new is not None else old for new, old in zip(row, last or row, strict=True)]
-        yield np.concatenate(last, axis=1)
+        yield arranged(last)
     for _ in range(hold):
-        yield np.concatenate(last, axis=1)
+        yield arranged(last)
+
+
+def arranged(panels: list[Frame]) -> Frame:
+    """All panels in one picture, by rows; what is left of the last row is white."""
+    columns = len(panels) if len(panels) <= IN_A_ROW else math.ceil(math.sqrt(len(panels)))
+    panels = [*panels, *[np.full_like(panels[0], 255)] * (-len(panels) % columns)]
+    rows = [np.concatenate(panels[i : i + columns], axis=1) for i in range(0, len(panels), columns)]
+    return np.concatenate(rows)
 
 
 def _stage_of(episode: Episode) -> tuple[str, str | None]:

@@ -24,11 +24,16 @@ WORLDS, CHUNK = 64, 100
 LEFT_OUT = 0.01
 """Weight γᵏ of the first reward that the return from a state leaves out, unless the episode ends before."""
 
-LONGEST = 10_000
-"""Most steps that a return may take."""
+LONGEST = 50_000
+"""Most steps that a return is followed for."""
 
 BINS = 20
 """Of the histogram of the probability integral transform."""
+
+
+def steps_that_count(gamma: float) -> int:
+    """How many rewards of a return have a weight γᵏ above `LEFT_OUT`, at most `LONGEST`."""
+    return int(np.count_nonzero(gamma ** np.arange(LONGEST) > LEFT_OUT))
 
 
 def calibrate(run_dir: Path, config: Config, *, which: str, index: int = 0, seed: int = 0, watch: Watch = unwatched) -> dict[str, Any]:
@@ -40,9 +45,8 @@ def calibrate(run_dir: Path, config: Config, *, which: str, index: int = 0, seed
     `pit` the share of returns in each of `BINS` equal parts of probability. Raises ConfigError where γ is too near 1 for returns to
     be followed, and as `restore.trained`.
     """
-    if config.gamma**LONGEST > LEFT_OUT:
-        raise invalid("gamma", config.gamma, f"at most {LEFT_OUT ** (1 / LONGEST):.5f}, so that returns can be followed to their end")
-    tail = sum(config.gamma**k > LEFT_OUT for k in range(LONGEST))
+    if (tail := steps_that_count(config.gamma)) == LONGEST:
+        raise invalid("gamma", config.gamma, f"at most {LEFT_OUT ** (1 / LONGEST):.4f}, so that returns can be followed to their end")
     found = restore.trained(run_dir, config, which)
     policy, critic = jax.tree.map(lambda x: x[index], (found.policy, found.critic))
     std = float(restore.reward_std(found.path, config)[index])

@@ -128,7 +128,8 @@ def _presets() -> str:
                 where.setdefault(f"`{flag(path)} {_word(value)}`", []).append((algo, env))
         settings: dict[tuple[tuple[str, str], ...], list[str]] = {}
         for setting, found in where.items():
-            settings.setdefault(tuple(found), []).append(setting)
+            for block in _blocks(found):
+                settings.setdefault(block, []).append(setting)
         rows += [(f"`{name}`", *_cells(found), ", ".join(settings[found])) for found in sorted(settings, key=len, reverse=True)]
     return _table(("`--preset`", "algorithms", "tasks", "sets"), rows)
 
@@ -144,10 +145,14 @@ def _changed(config: Any, start: Any, prefix: str = "") -> dict[str, Any]:
     return out
 
 
+def _blocks(cells: Sequence[tuple[str, str]]) -> list[tuple[tuple[str, str], ...]]:
+    """The cells as blocks of some algorithms × some tasks: algorithms with the same tasks are one."""
+    tasks_of = {algo: tuple(env for other, env in cells if other == algo) for algo, _ in cells}
+    return [tuple((a, env) for a, env in cells if tasks_of[a] == tasks) for tasks in dict.fromkeys(tasks_of.values())]
+
+
 def _cells(cells: Sequence[tuple[str, str]]) -> tuple[str, str]:
     algos, tasks = (list(dict.fromkeys(each)) for each in zip(*cells, strict=True))
-    if len(cells) != len(algos) * len(tasks):
-        raise ValueError(f"a setting of a preset is for {cells}, which are not all pairs of some algorithms and some tasks")
     return ("all" if len(algos) == len(algorithms.TABLE) else ", ".join(algos)), ("all" if len(tasks) == len(TASKS) else ", ".join(tasks))
 
 

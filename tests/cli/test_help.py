@@ -64,7 +64,7 @@ def test_settings_stand_below_headings_with_the_defaults_of_the_algorithm_that_i
     headings = re.findall(r"^[^\w\n]*(?:(\w+) )?options[^\w\n]*$", out, re.MULTILINE)
     assert headings == ["", "task", "noise", "algorithm", "rollout", "policy", "critic", "run", "evaluation", "device", "diagnostics"]
     words = " ".join(out.split())
-    assert "summed over the action's dimensions [nats]. (default: 0.02)" in words
+    assert "summed over the action's dimensions [nats]. (default: 0.03)" in words
     assert "never exceeded [environment steps]. (default: 1_000_000)" in words
 
 

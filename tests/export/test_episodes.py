@@ -35,7 +35,7 @@ def alone(env, action, number, steps):
     """Rewards and positions of the same episode."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        world = gymnasium.make(env)
+        world = gymnasium.make(env, max_episode_steps=10_000)
     world.reset(seed=number)
     rewards, qpos = [], []
     for _ in range(steps):
@@ -92,3 +92,9 @@ def test_scenes_are_the_initial_states_of_an_evaluation(monkeypatch):
     list(episodes._played(["a", "b"], episodes.Shots(2, 5, 1.0)))
     first, second = (int(n) for n in episode_seeds(5, 2))
     assert played == [("a", first, 1.0), ("b", first, 1.0), ("a", second, 1.0), ("b", second, 1.0)]
+
+
+def test_a_far_sighted_return_is_followed_for_longer_than_an_episode():
+    episode = play(actor("swimmer", (0.5, -0.5), gamma=0.999, episode_length=100), 7, 0.04)
+    rewards, _ = alone("Swimmer-v4", (0.5, -0.5), 7, 1 + 4603)  # ln 0.01 / ln 0.999 = 4602.9
+    np.testing.assert_allclose(episode.came, [sum(0.999**k * r for k, r in enumerate(rewards)) / 2])

@@ -7,7 +7,7 @@ import pytest
 from PIL import Image
 
 from dgae_jax.export import film, video
-from dgae_jax.export.film import shown, side_by_side
+from dgae_jax.export.film import arranged, shown, side_by_side
 from tests.helpers import film_of
 
 
@@ -74,3 +74,10 @@ def test_a_film_without_frames_and_a_directory_that_is_not_there_are_errors(tmp_
 
 def test_half_a_second_at_least_is_left_to_see_how_an_episode_ended():
     assert film.HOLD >= 0.5
+
+
+def test_up_to_three_robots_stand_in_a_row_and_more_in_a_square_with_white_for_those_that_are_missing():
+    one, two, three, four, five = (np.full((2, 2, 3), level, np.uint8) for level in (1, 2, 3, 4, 5))
+    assert arranged([one, two, three])[0, :, 0].tolist() == [1, 1, 2, 2, 3, 3]
+    assert arranged([one, two, three, four])[::2, ::2, 0].tolist() == [[1, 2], [3, 4]]
+    assert arranged([one, two, three, four, five])[::2, ::2, 0].tolist() == [[1, 2, 3], [4, 5, 255]]

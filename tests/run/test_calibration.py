@@ -41,7 +41,7 @@ def test_neighbours_in_the_wrong_order_are_counted():
     ("changes", "message"),
     [
         ({"algo": "ppo"}, "must be a run with a value distribution, not ppo"),
-        ({"algo": "dppo", "gamma": 0.9999}, "gamma 0.9999: must be at most 0.99954, so that returns can be followed to their end"),
+        ({"algo": "dppo", "gamma": 0.99999}, "gamma 0.99999: must be at most 0.9999, so that returns can be followed to their end"),
     ],
 )
 def test_what_cannot_be_compared_is_refused_in_one_line(changes, message, tmp_path, monkeypatch, capsys):
