@@ -85,7 +85,8 @@ def test_command_lines_of_train_mean_a_valid_configuration(path):
             try:
                 train.parsed(words)
             except ConfigError as mistake:
-                pytest.fail(f"{words}: {mistake}")
+                if "pip install" not in str(mistake):  # for an extra that is not here
+                    pytest.fail(f"{words}: {mistake}")
 
 
 def test_the_page_of_settings_is_what_the_dataclasses_say():
