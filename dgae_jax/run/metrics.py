@@ -18,13 +18,13 @@ from dgae_jax.run import files
 class MetricsFile:
     """Appends to `metrics.jsonl`; `steps` counts the samples of one run, numbers that do not exist are null.
 
-    Of the rows it keeps only the episode returns, so that a long run does not fill the memory.
+    Of the rows it keeps only the episode returns and how many had an update left out, so that a long run does not fill the memory.
     """
 
     def __init__(self, path: Path, config: Config, done: int):
         """Keep the rows of the first `done` iterations; raises ConfigError if the file lacks any of them."""
         self.path, self.first_seed, self.seeds, self.samples = path, config.seed, config.num_seeds, config.samples_per_iteration
-        self.iteration, self.seconds = 0, 0.0
+        self.iteration, self.seconds, self.skipped = 0, 0.0, 0
         self.returns = array("d")
         """Episode returns of the rows so far, NaN where there was none."""
         end = 0
@@ -44,6 +44,7 @@ class MetricsFile:
         value = row["episode_return"]
         self.iteration, self.seconds = row["iteration"], float(row["seconds"])
         self.returns.append(math.nan if value is None else value)
+        self.skipped += bool(row.get("skipped"))
 
     def append(self, metrics: dict[str, Any], count: int, seconds: float) -> list[dict[str, Any]]:
         """Write `count` iterations of metrics [capacity, S]; `seconds` is the time since training began."""

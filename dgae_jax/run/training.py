@@ -1,6 +1,7 @@
 """One run, from its state to its evaluation: dispatch by dispatch until the budget is used or something ends it."""
 
 import contextlib
+import itertools
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -66,8 +67,9 @@ def run_to_end(config: Config, options: RunOptions, run_dir: Path, state: TrainS
                     directory.write_config(run_dir, config)
                     manifest.add(run_dir, options)
                 state = _iterate(config, options, record, signals, state, heed)
-                if _broken(state, options):
-                    raise BrokeDownError(1, _broke_down(state, run_dir))
+                if record.metrics.skipped:
+                    of = config.iterations * config.num_seeds
+                    terminal.warn(f"warning: in {record.metrics.skipped:,} of {of:,} iterations an update was not finite and was left out")
                 result = _evaluate(config, options, record, signals, state)
             files.write_json(run_dir / "evaluation.json", result)
         except Stopped:
@@ -88,10 +90,12 @@ def run_to_end(config: Config, options: RunOptions, run_dir: Path, state: TrainS
 
 
 def _iterate(config: Config, options: RunOptions, record: Record, signals: Signals, state: TrainState | None, heed: Heed) -> TrainState:
-    """All iterations that are left, until the budget is used, a signal came, or it broke down."""
+    """All iterations that are left, until the budget is used or a signal came; raises BrokeDownError, with all saved."""
     every = max(1, options.checkpoint_every // config.samples_per_iteration)
     done, count, seconds = record.metrics.iteration, 1, 0.0
+    row = np.zeros(config.num_seeds, int) if state is None else np.asarray(hosts.whole(state.failures))
     if state is not None and done == config.iterations:
+        _check(row, options, record.run_dir)
         return state
     trainer = make_trainer(make_task(config), CAPACITY, make_mesh((options.devices or 1) * jax.process_count()))
     with Reporter(config.iterations * config.samples_per_iteration, config.num_seeds, record.page) as reporter:
@@ -104,17 +108,17 @@ def _iterate(config: Config, options: RunOptions, record: Record, signals: Signa
             count = min(count, config.iterations - done, every - done % every)
             since, warm = time.monotonic(), seconds > 0
             state, measured = _dispatch(config, trainer, state, count, record)
-            mean_return = record.append(state, measured, count)
+            mean_return, rows = record.append(state, measured, count), _failures(row, measured, count, config.samples_per_iteration)
+            row, broken = rows[-1], rows.max() >= options.max_nonfinite
             seconds, done = (time.monotonic() - since) / count, done + count
             if warm:  # the first dispatch says nothing about speed
                 reporter.update(done * config.samples_per_iteration, config.samples_per_iteration / seconds, mean_return)
             count = hosts.first(int(np.clip(DISPATCH_SECONDS / seconds, 1, CAPACITY))) if warm else 1
-            broken, due, stopping = _broken(state, options), done % every == 0, signals.anywhere()
+            due, stopping = done % every == 0, signals.anywhere()
             if due or done == config.iterations or stopping or broken:
                 record.save(state)
                 record.draw()
-            if broken:
-                break
+            _check(rows, options, record.run_dir)
             if due and done < config.iterations:
                 _look(record, state, signals, reporter, heed)
                 stopping = signals.anywhere()  # all is saved
@@ -158,14 +162,21 @@ def _evaluate(config: Config, options: RunOptions, record: Record, signals: Sign
         return record.evaluate(hosts.whole(policies_of(state)), reporter.watch)
 
 
-def _broken(state: TrainState, options: RunOptions) -> bool:
-    return int(hosts.whole(state.failures).max()) >= options.max_nonfinite
+def _failures(before: np.ndarray, measured: dict[str, Any], count: int, samples: int) -> np.ndarray:
+    """How many iterations in a row have failed at each of `count` [count, S], as `TrainState.failures` [S] counts: an iteration that
+    succeeds in between ends a row, and a dispatch does not hide it.
+    """
+    skipped, nonfinite = (np.asarray(measured[name])[:count] for name in ("skipped", "nonfinite"))
+    failed = (skipped > 0) | (nonfinite > samples / 2)
+    rows = itertools.accumulate(failed, lambda row, fails: np.where(fails, row + 1, 0), initial=before)
+    return np.stack(list(rows)[1:])
 
 
-def _broke_down(state: TrainState, run_dir: Path) -> str:
-    lately = f"in each of the last {int(hosts.whole(state.failures).max())} iterations"
-    reason = f"{lately} updates were not finite and were left out, or most world steps were not finite"
-    return f"stopped: {reason}; the last finite state is in {run_dir}"
+def _check(failures: np.ndarray, options: RunOptions, run_dir: Path) -> None:
+    """Raise BrokeDownError where too many iterations in a row have failed."""
+    if (most := int(failures.max())) >= options.max_nonfinite:
+        reason = f"in {most} iterations in a row updates were not finite and were left out, or most world steps were not finite"
+        raise BrokeDownError(1, f"stopped: {reason}; the last finite state is in {run_dir}")
 
 
 def _left(run_dir: Path) -> str:

@@ -9,6 +9,7 @@ import signal
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 import pytest
 
 from dgae_jax.run import directory, metrics, restore, training
@@ -103,6 +104,12 @@ def test_updates_that_are_not_finite_are_left_out_and_counted_and_end_the_run_wh
     state, _ = restore.training_state(tmp_path / "run", directory.read_config(tmp_path / "run"))
     assert all(jnp.isfinite(x).all() for fit in (state.policy, state.critic) for x in fit.params["params"]["Dense_0"].values())
     assert not (tmp_path / "run" / "evaluation.json").exists()
+
+
+def test_failures_in_a_row_are_seen_also_where_a_success_followed_before_anybody_looked():
+    skipped, nonfinite = np.array([[1, 0], [1, 0], [0, 0], [1, 0], [9, 9]]), np.array([[0, 0], [0, 33], [32, 33], [0, 0], [9, 9]])
+    rows = training._failures(np.array([2, 0]), {"skipped": skipped, "nonfinite": nonfinite}, 4, 64)
+    assert rows.tolist() == [[3, 0], [4, 1], [0, 2], [1, 0]]  # half of the 64 steps is not most of them
 
 
 @pytest.mark.parametrize("reason", [MemoryError(), jax.errors.JaxRuntimeError("RESOURCE_EXHAUSTED: Out of memory.\nmore")])
