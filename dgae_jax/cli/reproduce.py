@@ -106,9 +106,17 @@ def _cells(arguments: Arguments, rest: list[str]) -> tuple[list[matrix.Cell], Ru
         algo, *words = kinds[kind].split()
         config, options = train.parsed([*start, "--env", task, "--algo", algo, *words, *rest])
         _refuse(config, options, task, algo)
-        return config if arguments.scale == 1 else dataclasses.replace(config, total_steps=int(arguments.scale * config.total_steps))
+        return config if arguments.scale == 1 else _scaled(config, arguments.scale)
 
     return matrix.matrix(arguments.envs, list(kinds), arguments.seeds, arguments.seeds_per_run, make), options
+
+
+def _scaled(config: Config, scale: float) -> Config:
+    steps = int(scale * config.total_steps)
+    if steps < config.samples_per_iteration:
+        share = f"{config.samples_per_iteration:,} of {config.total_steps:,} samples"
+        raise invalid("scale", scale, f"large enough for one iteration of {config.algo} on {config.env}, {share}")
+    return dataclasses.replace(config, total_steps=steps)
 
 
 def _kinds(arguments: Arguments) -> dict[str, str]:

@@ -150,6 +150,8 @@ def hold(file: IO, in_use: ConfigError) -> None:
 
 def read_config(path: Path) -> Config:
     """The configuration of a run; raises ConfigError if `path` is not a run directory, or one with links or devices in it."""
+    if not path.is_dir():
+        raise ConfigError(f"{path}: must be a run directory; there is {'a file' if path.exists() else 'nothing'} of that name")
     for name in ("checkpoints", "nonfinite", "tensorboard", "wandb", "mlflow"):
         _check_own(path / name, "directory", stat.S_ISDIR)
     for name in ("config.json", "manifest.json", "metrics.jsonl", "evaluations.jsonl", "sinks.json"):

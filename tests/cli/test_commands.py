@@ -268,7 +268,7 @@ def test_an_output_that_is_no_file_is_left_alone(trained, run, tmp_path):
 @pytest.mark.parametrize(
     ("argv", "message"),
     [
-        (["nowhere"], r"nowhere/config.json: must be a configuration that can be read \(No such file or directory\)"),
+        (["nowhere"], r"nowhere: must be a run directory; there is nothing of that name"),
         ([], r"RUN_DIR: must be given"),
         ([".", "--engine", "ode"], r"--engine ode: must be one of .*gymnasium"),
         ([".", "--episodes", "0"], r"--episodes 0: must be a whole number from 1 to 10,000"),

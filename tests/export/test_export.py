@@ -88,7 +88,7 @@ def test_each_seed_and_each_checkpoint_has_its_own_weights(run_dir, run, tmp_pat
 @pytest.mark.parametrize(
     ("argv", "message"),
     [
-        (["nowhere", "--to", "npz"], r"nowhere/config\.json: must be a configuration that can be read \(No such file or directory\)"),
+        (["nowhere", "--to", "npz"], r"nowhere: must be a run directory; there is nothing of that name"),
         (["RUN", "--to", "tflite"], r"--to tflite: must be one of npz, onnx, gymnasium"),
         (["RUN"], r"--to"),
         (["RUN", "--to"], r"--to"),

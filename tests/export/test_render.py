@@ -138,7 +138,7 @@ def test_the_scale_of_rewards_is_that_of_the_training_state(distributional):
 @pytest.mark.parametrize(
     ("argv", "message"),
     [
-        (["nowhere"], r"nowhere/config\.json: must be a configuration that can be read \(No such file or directory\)"),
+        (["nowhere"], r"nowhere: must be a run directory; there is nothing of that name"),
         ([".", "--episodes", "0"], r"--episodes 0: must be a whole number from 1 to 1,000"),
         ([".", "--width", "481"], r"--width 481: must be an even number from 160 to 1,920"),
         ([".", "--seconds", "0"], r"--seconds 0\.0: must be a number above 0, up to 600"),

@@ -143,6 +143,7 @@ def test_a_signal_stops_all_cells_with_a_checkpoint_and_the_same_command_goes_on
         (["--algos", "sac"], "error: --algo sac: must be one of "),
         (["--launcher", "cloud"], "error: --launcher cloud: must be one of local, ray, slurm"),
         (["--scale", "2"], "error: --scale 2.0: must be above 0 and at most 1"),
+        (["--scale", "0.001"], "error: --scale 0.001: must be large enough for one iteration of ppo on ant, 2,048 of 1,000,000 samples"),
         (["--scale", "0.1", "--total-steps", "1000"], "error: --scale 0.1: must be left out with --total-steps"),
         (["--seeds", "0", "0"], "error: --seeds 0 0: must be at least one, each once"),
         (["--preset", "best"], "error: --preset best: must be one of tuned, paper"),
