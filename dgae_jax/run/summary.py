@@ -47,7 +47,12 @@ def describe(result: dict[str, Any]) -> str:
     """An evaluation in one line."""
     seeds, where = len(result["seeds"]), f"of the deterministic policy in {result['env']} ({result['engine']})"
     if seeds == 1:
-        return f"return {result['return_mean']:,.1f} ± {result['return_std']:,.1f} over {result['episodes']} episodes {where}"
+        return f"return {result['return_mean']:,.1f} ± {result['return_std']:,.1f} over {so_many_episodes(result['episodes'])} {where}"
     low, high = result["interval"]
     spread = f"standard deviation {result['seeds_std']:,.1f} over seeds, 95 % interval of the mean {low:,.1f} to {high:,.1f}"
-    return f"return {result['seeds_mean']:,.1f}, mean of {seeds} seeds × {result['episodes'] // seeds} episodes {where}; {spread}"
+    return f"return {result['seeds_mean']:,.1f}, mean of {seeds} seeds × {so_many_episodes(result['episodes'] // seeds)} {where}; {spread}"
+
+
+def so_many_episodes(number: int) -> str:
+    """With the plural where there is one."""
+    return f"{number} episode{'s' if number > 1 else ''}"

@@ -202,7 +202,7 @@ def test_the_card_says_what_the_runs_files_say(runs, tmp_path):
     bundle.export(run_dir, config, "newest", 0, ["npz", "onnx", "gymnasium"], tmp_path)
     cards = {kind: (tmp_path / kind / "README.md").read_text() for kind in bundle.FILES}
     evaluation, manifest = (json.loads((run_dir / name).read_text()) for name in ("evaluation.json", "manifest.json"))
-    worth = f"{evaluation['return_mean']:,.1f} ± {evaluation['return_std']:,.1f} over 1 episodes"
+    worth = f"{evaluation['return_mean']:,.1f} ± {evaluation['return_std']:,.1f} over 1 episode"
     for kind, text in cards.items():
         assert text.startswith("# DPPO on Hopper-v4\n")
         for row in (
@@ -255,7 +255,7 @@ def test_of_the_best_checkpoint_the_card_says_that_its_episodes_chose_it(runs, t
     best = max(means, key=lambda steps: (means[steps], steps))
     (mean,) = (row["return_mean"] for row in rows if (row["steps"], row["seed"]) == (best, 1))
     assert f"| samples | {best} |" in text
-    assert f"{mean:,.1f} ± 0.0 over 1 episodes, mean ± standard deviation, episodes which chose this checkpoint |" in text
+    assert f"{mean:,.1f} ± 0.0 over 1 episode, mean ± standard deviation, episodes which chose this checkpoint |" in text
 
 
 def test_facts_of_a_policys_file_come_from_the_row_of_its_study(tmp_path):

@@ -139,8 +139,8 @@ def test_a_signal_stops_all_cells_with_a_checkpoint_and_the_same_command_goes_on
 @pytest.mark.parametrize(
     ("argv", "message"),
     [
-        (["--envs", "hoper"], "error: --env hoper: must be "),
-        (["--algos", "sac"], "error: --algo sac: must be one of "),
+        (["--envs", "hoper"], "error: --envs hoper: must be "),
+        (["--algos", "sac"], "error: --algos sac: must be one of "),
         (["--launcher", "cloud"], "error: --launcher cloud: must be one of local, ray, slurm"),
         (["--scale", "2"], "error: --scale 2.0: must be above 0 and at most 1"),
         (["--scale", "0.001"], "error: --scale 0.001: must be large enough for one iteration of ppo on ant, 2,048 of 1,000,000 samples"),
