@@ -25,11 +25,11 @@ def table(found: dict) -> str:
     tasks = {(row["task"], row["width"]) for row in found["ours"]}
     for row in found["ours"]:
         rival = rival_of(row, found["peers"])
-        over = f"{row['steps_per_second'] / rival['steps_per_second']:.1f} ×" if rival else "–"
+        over, most = (f"{row[x] / rival['steps_per_second']:.1f} ×" if rival else "–" for x in ("steps_per_second", "roofline"))
         where = f", {row['task'].title()}, 2 × {row['width']}" if len(tasks) > 1 else ""
         name = f"{row['algo'].upper()}, `{row['physics']}`{where}"
         share = row["steps_per_second"] / row["roofline"]
-        lines.append(f"| {name} | {row['compile_seconds']:.1f} s | {row['steps_per_second']:,.0f} | {over} | {share:.2f} |")
+        lines.append(f"| {name} | {row['compile_seconds']:.1f} s | {row['steps_per_second']:,.0f} | {over} | {share:.2f} of {most} |")
     fastest = {}
     for peer in sorted(found["peers"], key=lambda peer: peer["steps_per_second"]):
         fastest[peer["name"].split()[0], peer["task"], peer["width"], peer["algo"]] = peer
