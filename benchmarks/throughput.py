@@ -92,10 +92,13 @@ def fastest(f: Callable[[], Any], seconds: float) -> float:
 
 
 def setting(task: str, algo: str, physics: str, width: int) -> Config:
-    """The defaults of an algorithm on a task, with both networks as wide as asked for."""
+    """The defaults of an algorithm on a task, with both networks as wide as asked for; A2C takes one step per rollout of 8, as its peer."""
     config = dg.preset("tuned", algo, task)
-    policy, critic = (dataclasses.replace(part, hidden=(width, width)) for part in (config.policy, config.critic))
-    return resolve(dataclasses.replace(config, physics=physics, policy=policy, critic=critic))
+    as_peer = PEER_OF[algo] == "A2C"
+    steps = {"optimizer": "rmsprop", "epochs": 1, "minibatches": 1} if as_peer else {}
+    policy, critic = (dataclasses.replace(part, hidden=(width, width), **steps) for part in (config.policy, config.critic))
+    horizon = 8 if as_peer else config.horizon
+    return resolve(dataclasses.replace(config, physics=physics, horizon=horizon, policy=policy, critic=critic))
 
 
 class Iteration(NamedTuple):

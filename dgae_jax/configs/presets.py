@@ -13,10 +13,13 @@ Settings = dict[str, Any]
 
 def _tuned(update: str, critic: str, env: str) -> list[Settings]:
     """One setting per way to update; a task departs from it only where it must."""
-    once = {"optimizer": "rmsprop", "learning_rate": 7e-4, "epochs": 1, "minibatches": 1}
     by_update: dict[str, Settings] = {
         "clip": {"num_envs": 64, "horizon": 32},
-        "gradient": {"horizon": 8, "policy": once, "critic": once},
+        "gradient": {
+            "horizon": 32,
+            "policy": {"optimizer": "rmsprop", "learning_rate": 7e-4, "epochs": 1, "minibatches": 16},
+            "critic": {"learning_rate": 1e-3, "epochs": 5, "minibatches": 16},
+        },
         "trust-region": {
             "policy": {"initial_std": 1.0, "radius": 0.03, "damping": 0.3, "cg_iterations": 25},
             "critic": {"learning_rate": 1e-3, "learning_rate_end": 1.0, "epochs": 20, "minibatches": 16},
