@@ -13,8 +13,9 @@ from dgae_jax.learn import normalizers
 from dgae_jax.learn.iteration import acting
 from dgae_jax.learn.rollout import Episodes, rollout, start
 from dgae_jax.learn.types import Fitted, Transition
-from dgae_jax.maths.returns import lambda_sum
+from dgae_jax.maths.returns import bellman_target, lambda_sum
 from dgae_jax.maths.statistics import coverage, crps, pit
+from dgae_jax.maths.transport import directional_metric, wasserstein
 from dgae_jax.run import restore
 from dgae_jax.run.compiling import Watch, compile_aside, unwatched
 
@@ -26,6 +27,9 @@ LEFT_OUT = 0.01
 
 LONGEST = 50_000
 """Most steps that a return is followed for."""
+
+SHARES = (0.1, 0.03, 0.01, 0.003)
+"""Of W₁, up to which |d| counts as that of similar means."""
 
 BINS = 20
 """Of the histogram of the probability integral transform."""
@@ -42,7 +46,8 @@ def calibrate(run_dir: Path, config: Config, *, which: str, index: int = 0, seed
     Returns are of scaled rewards, as the critic's, followed until γᵏ < `LEFT_OUT` without a time limit: `coverage_90` is the share
     of them inside the central 90 % of the quantiles, `crossing` the share of neighbouring quantiles in the wrong order, `bias` and
     `rmse` those of the mean, `spread` the mean standard deviation of the quantiles, `crps` the continuous ranked probability score,
-    `pit` the share of returns in each of `BINS` equal parts of probability. Raises ConfigError where γ is too near 1 for returns to
+    `pit` the share of returns in each of `BINS` equal parts of probability, `similar_means` the shares of steps whose target and
+    prediction have similar means for their shapes (`similar`). Raises ConfigError where γ is too near 1 for returns to
     be followed, and as `restore.trained`.
     """
     if (tail := steps_that_count(config.gamma)) == LONGEST:
@@ -71,8 +76,10 @@ def calibrate(run_dir: Path, config: Config, *, which: str, index: int = 0, seed
         parts.append((step.reward / std, config.gamma * (1.0 - step.terminated), quantiles if kept else None))
     rewards, discounts, predicted = zip(*parts, strict=True)
     quantiles = jnp.concatenate([each for each in predicted if each is not None])
-    outcome = lambda_sum(jnp.concatenate(rewards), jnp.concatenate(discounts))[: len(quantiles)]
-    return {"checkpoint": found.path.name, "samples": outcome.size, **statistics(quantiles, outcome)}
+    reward, discount = jnp.concatenate(rewards), jnp.concatenate(discounts)
+    outcome = lambda_sum(reward, discount)[: len(quantiles)]
+    about = {"checkpoint": found.path.name, "samples": outcome.size}
+    return {**about, **statistics(quantiles, outcome), "similar_means": similar(reward, discount, quantiles)}
 
 
 def statistics(quantiles: jax.Array, outcome: jax.Array) -> dict[str, Any]:
@@ -89,3 +96,11 @@ def statistics(quantiles: jax.Array, outcome: jax.Array) -> dict[str, Any]:
     }
     bins = np.histogram(probability, BINS, (0, 1))[0] / probability.size
     return {**{name: round(float(value), 6) for name, value in found.items()}, "pit": [round(float(share), 6) for share in bins]}
+
+
+def similar(reward: jax.Array, discount: jax.Array, quantiles: jax.Array) -> dict[str, float]:
+    """By each of `SHARES`, the share of steps [T − 1, N] with |d(r + γG′, G)| ≤ share · W₁(r + γG′, G) (Sec. results)."""
+    before, after = quantiles[:-1], quantiles[1:]
+    target = bellman_target(reward[: len(before)], discount[: len(before)], after)
+    ratio = np.asarray(jnp.abs(directional_metric(target, before)) / wasserstein(target, before))
+    return {str(share): round(float((ratio <= share).mean()), 6) for share in SHARES}

@@ -37,6 +37,16 @@ def test_neighbours_in_the_wrong_order_are_counted():
     assert calibration.statistics(UNIFORM[..., ::-1], RETURNS)["crossing"] == 1
 
 
+def test_means_are_similar_where_target_and_prediction_differ_in_shape_alone():
+    reward, discount = jnp.zeros((4, 1)), jnp.ones((4, 1))
+    # of two quantiles: twice as wide (d = 0, W₁ = 1), moved by 1 (d = W₁ = 1), moved by −1 on one side and 0.95 on the other
+    quantiles = jnp.array([[-1.0, 1.0], [-2.0, 2.0], [-1.0, 3.0], [-2.0, 3.95]])[:, None]
+    # d = (−1 + 0.95) / 2 = −0.025 and W₁ = 0.975 in the last step, a share of 0.0256
+    assert calibration.similar(reward, discount, quantiles) == pytest.approx(
+        {"0.1": 2 / 3, "0.03": 2 / 3, "0.01": 1 / 3, "0.003": 1 / 3}, abs=1e-6
+    )
+
+
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
@@ -60,6 +70,6 @@ def test_the_command_writes_statistics_beside_every_run_and_a_picture(tmp_path, 
     assert helpers.command("calibrate")() == 0
     found = json.loads((tmp_path / "run" / "calibration.json").read_text())
     assert found["samples"] == calibration.WORLDS * calibration.CHUNK  # episodes of 20 steps, in whole chunks
-    assert np.isfinite([*found["pit"], found["rmse"], found["crps"]]).all()
+    assert np.isfinite([*found["pit"], found["rmse"], found["crps"], *found["similar_means"].values()]).all()
     assert (tmp_path / "run" / "calibration.png").read_bytes().startswith(b"\x89PNG")
     assert "of the returns in the central 90 %" in capsys.readouterr().out
