@@ -15,8 +15,8 @@ import tyro
 from dgae_jax.cli import train
 from dgae_jax.cli.arguments import fail, parse_known
 from dgae_jax.configs.algorithms import TABLE
-from dgae_jax.configs.config import Config, ConfigError, invalid, lookup
-from dgae_jax.envs.registry import TASKS, spec_of
+from dgae_jax.configs.config import Config, ConfigError, invalid, lookup, task_spec
+from dgae_jax.envs.registry import TASKS
 from dgae_jax.run import terminal
 from dgae_jax.run.options import RunOptions, to_dict
 from dgae_jax.study import matrix
@@ -88,10 +88,7 @@ def _cells(arguments: Arguments, rest: list[str]) -> tuple[list[matrix.Cell], Ru
         if not given or len(set(given)) < len(given):
             raise invalid(name, given, "at least one, each once")
     for task in arguments.envs:
-        try:
-            spec_of(task)
-        except ValueError as allowed:
-            raise invalid("envs", task, str(allowed)) from None
+        task_spec(Config(env=task), "envs")
     for algo in arguments.algos:
         lookup("algos", algo, TABLE)
     if not all(0 <= seed < 2**32 for seed in arguments.seeds):

@@ -209,12 +209,12 @@ def lookup(setting: str, name: Any, table: Mapping[str, Any]) -> Any:
     return table[name]
 
 
-def task_spec(config: Config) -> EnvSpec:
-    """What exists of the configuration's task; raises ConfigError, naming the tasks, for an unknown one."""
+def task_spec(config: Config, setting: str = "env") -> EnvSpec:
+    """What exists of the configuration's task; raises ConfigError, naming the tasks, for an unknown one, given as `setting`."""
     try:
         return spec_of(config.env)
     except ValueError as allowed:
-        raise invalid("env", config.env, str(allowed)) from None
+        raise invalid(setting, config.env, str(allowed)) from None
 
 
 def flag(setting: str) -> str:

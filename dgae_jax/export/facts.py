@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 from dgae_jax.configs.config import Config
 from dgae_jax.run import files, manifest
 from dgae_jax.run.evaluations import EvaluationsFile
-from dgae_jax.run.summary import so_many_episodes
+from dgae_jax.run.summary import counted
 
 
 class Facts(NamedTuple):
@@ -60,6 +60,6 @@ def _row_of_study(source: Path, seed: int) -> dict[str, Any]:
 def _returns(evaluation: Any) -> str | None:
     try:
         mean, std, episodes = evaluation["return_mean"], evaluation["return_std"], len(evaluation["returns"])
-        return f"{mean:,.1f} ± {std:,.1f} over {so_many_episodes(episodes)}"
+        return f"{mean:,.1f} ± {std:,.1f} over {counted(episodes, 'episode')}"
     except (TypeError, KeyError, ValueError):
         return None

@@ -3,7 +3,7 @@
 from collections.abc import Callable
 
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from dgae_jax.maths.returns import bellman_target, lambda_return
 from dgae_jax.maths.statistics import coverage, pit
@@ -35,12 +35,16 @@ def of_critic(
     """
     outcome = lambda_return(reward, discount, continues, quantiles, next_quantiles)
     probability, target = pit(quantiles, outcome), bellman_target(reward, discount, next_quantiles)
-    similar = jnp.abs(directional_metric(target, quantiles)) <= SIMILAR * wasserstein(target, quantiles)
     return {
         "critic/wasserstein": jnp.abs(quantiles - outcome[..., None]).mean(),
         "critic/crossing": (quantiles[..., 1:] < quantiles[..., :-1]).mean() if quantiles.shape[-1] > 1 else jnp.zeros(()),
         "critic/coverage_90": coverage(quantiles, outcome, 0.9),
         "critic/pit_mean": probability.mean(),
         "critic/pit_std": probability.std(),
-        "critic/similar_means": similar.mean(),
+        "critic/similar_means": similar_means(target, quantiles).mean(),
     }
+
+
+def similar_means(target: Float[Array, "*batch K"], quantiles: Float[Array, "*batch K"], share: float = SIMILAR) -> Bool[Array, "*batch"]:
+    """Whether two distributions differ in shape rather than in mean, |d| ≤ share · W₁ (Sec. results)."""
+    return jnp.abs(directional_metric(target, quantiles)) <= share * wasserstein(target, quantiles)

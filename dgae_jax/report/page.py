@@ -9,6 +9,7 @@ from dgae_jax.report.deviations import deviations
 from dgae_jax.report.groups import Group, by_task, groups_of
 from dgae_jax.report.published import Published
 from dgae_jax.report.results import Study
+from dgae_jax.run.summary import counted
 
 
 class Content(NamedTuple):
@@ -63,14 +64,10 @@ def _summary(content: Content) -> str:
     seeds, steps = len({row.seed for row in rows}), sorted({row.total_steps for row in rows})
     budget = f"{steps[0]:,}" if len(steps) == 1 else f"{steps[0]:,} to {steps[-1]:,}"
     counts = {"task": len(content.tasks), "algorithm": len({group.algo for group in content.groups}), "seed": seeds}
-    told = ", ".join(_count(number, noun) for noun, number in counts.items())
-    text = f"{_count(len(rows), 'trained run')}: {told}, {budget} environment steps each."
+    told = ", ".join(counted(number, noun) for noun, number in counts.items())
+    text = f"{counted(len(rows), 'trained run')}: {told}, {budget} environment steps each."
     some = ", ".join(missing[:10]) + (f" and {len(missing) - 10} more" if len(missing) > 10 else "")
     return text + (f" Cells without a result: {some}." if missing else "")
-
-
-def _count(number: int, noun: str) -> str:
-    return f"{number} {noun}" + "s" * (number != 1)
 
 
 def _returns(content: Content) -> str:
@@ -126,7 +123,7 @@ def _profile(content: Content) -> str:
     if not scores:
         return ""
     runs = ", ".join(
-        f"{name} {_count(sum(map(len, strata)), 'run')} of {_count(len(strata), 'task')}" for name, (_, strata) in scores.items()
+        f"{name} {counted(sum(map(len, strata)), 'run')} of {counted(len(strata), 'task')}" for name, (_, strata) in scores.items()
     )
     note = f"Share of runs whose final return, over the best mean of the task, is above τ; the shade is its 95 % interval. {runs}."
     alt = f"Performance profiles of {', '.join(scores)}."

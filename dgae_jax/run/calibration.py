@@ -10,12 +10,12 @@ import numpy as np
 from dgae_jax.configs.build import make_algorithm, make_task
 from dgae_jax.configs.config import Config, invalid
 from dgae_jax.learn import normalizers
+from dgae_jax.learn.diagnostics import SIMILAR, similar_means
 from dgae_jax.learn.iteration import acting
 from dgae_jax.learn.rollout import Episodes, rollout, start
 from dgae_jax.learn.types import Fitted, Transition
 from dgae_jax.maths.returns import bellman_target, lambda_sum
 from dgae_jax.maths.statistics import coverage, crps, pit
-from dgae_jax.maths.transport import directional_metric, wasserstein
 from dgae_jax.run import restore
 from dgae_jax.run.compiling import Watch, compile_aside, unwatched
 
@@ -28,7 +28,7 @@ LEFT_OUT = 0.01
 LONGEST = 50_000
 """Most steps that a return is followed for."""
 
-SHARES = (0.1, 0.03, 0.01, 0.003)
+SHARES = (SIMILAR, 0.03, 0.01, 0.003)
 """Of W₁, up to which |d| counts as that of similar means."""
 
 BINS = 20
@@ -102,5 +102,4 @@ def similar(reward: jax.Array, discount: jax.Array, quantiles: jax.Array) -> dic
     """By each of `SHARES`, the share of steps [T − 1, N] with |d(r + γG′, G)| ≤ share · W₁(r + γG′, G) (Sec. results)."""
     before, after = quantiles[:-1], quantiles[1:]
     target = bellman_target(reward[: len(before)], discount[: len(before)], after)
-    ratio = np.asarray(jnp.abs(directional_metric(target, before)) / wasserstein(target, before))
-    return {str(share): round(float((ratio <= share).mean()), 6) for share in SHARES}
+    return {str(share): round(float(similar_means(target, before, share).mean()), 6) for share in SHARES}

@@ -19,7 +19,7 @@ from dgae_jax.learn.parallel import Trainer
 from dgae_jax.learn.types import Fitted
 from dgae_jax.run import restore
 from dgae_jax.run.compiling import Watch, compile_aside, unwatched
-from dgae_jax.run.summary import over_seeds, so_many_episodes, summary
+from dgae_jax.run.summary import counted, over_seeds, summary
 
 CHUNK = 50
 """Steps between looks at signals and clock."""
@@ -98,7 +98,7 @@ def evaluate_policies(
     for i in range(config.num_seeds):
         of = f", seed {config.seed + i}" if config.num_seeds > 1 else ""
         one = jax.tree.map(lambda x, i=i: x[i], policies)
-        progress = _Progress(watch, f"evaluating {so_many_episodes(episodes)} in {where}{of}", config.episode_length)
+        progress = _Progress(watch, f"evaluating {counted(episodes, 'episode')} in {where}{of}", config.episode_length)
         per_run.append(run(one, config, engine, episodes, seed, progress))
     return {
         "engine": engine,

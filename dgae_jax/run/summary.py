@@ -47,12 +47,14 @@ def describe(result: dict[str, Any]) -> str:
     """An evaluation in one line."""
     seeds, where = len(result["seeds"]), f"of the deterministic policy in {result['env']} ({result['engine']})"
     if seeds == 1:
-        return f"return {result['return_mean']:,.1f} ± {result['return_std']:,.1f} over {so_many_episodes(result['episodes'])} {where}"
+        return f"return {result['return_mean']:,.1f} ± {result['return_std']:,.1f} over {counted(result['episodes'], 'episode')} {where}"
     low, high = result["interval"]
     spread = f"standard deviation {result['seeds_std']:,.1f} over seeds, 95 % interval of the mean {low:,.1f} to {high:,.1f}"
-    return f"return {result['seeds_mean']:,.1f}, mean of {seeds} seeds × {so_many_episodes(result['episodes'] // seeds)} {where}; {spread}"
+    return (
+        f"return {result['seeds_mean']:,.1f}, mean of {seeds} seeds × {counted(result['episodes'] // seeds, 'episode')} {where}; {spread}"
+    )
 
 
-def so_many_episodes(number: int) -> str:
-    """With the plural where there is one."""
-    return f"{number} episode{'s' if number > 1 else ''}"
+def counted(number: int, noun: str) -> str:
+    """A number of things, with the plural unless it is one."""
+    return f"{number} {noun}" + "s" * (number != 1)

@@ -23,7 +23,7 @@ from dgae_jax.run.options import RunOptions
 from dgae_jax.run.progress import Reporter
 from dgae_jax.run.record import Record
 from dgae_jax.run.signals import Signals, Stopped
-from dgae_jax.run.summary import so_many_episodes
+from dgae_jax.run.summary import counted
 
 CAPACITY = 64
 """Most iterations in one dispatch."""
@@ -158,7 +158,7 @@ def _look(record: Record, state: TrainState, signals: Signals, reporter: Reporte
 def _evaluate(config: Config, options: RunOptions, record: Record, signals: Signals, state: TrainState) -> dict[str, Any]:
     """The evaluation at the end, which may take longer than a short training."""
     with signals.may_stop(), Reporter(page=record.page) as reporter:
-        episodes = so_many_episodes(options.episodes) + (f" of each of {config.num_seeds} seeds" if config.num_seeds > 1 else "")
+        episodes = counted(options.episodes, "episode") + (f" of each of {config.num_seeds} seeds" if config.num_seeds > 1 else "")
         reporter.announce(f"evaluating {episodes} in {referee(config)} ({engines_of(config)[0]})")
         return record.evaluate(hosts.whole(policies_of(state)), reporter.watch)
 

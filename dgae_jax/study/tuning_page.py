@@ -12,7 +12,7 @@ from matplotlib.ticker import MaxNLocator
 from optuna.trial import FrozenTrial
 
 from dgae_jax.run import files
-from dgae_jax.run.summary import so_many_episodes
+from dgae_jax.run.summary import counted
 from dgae_jax.study.search import Range
 from dgae_jax.study.storage import unwarned
 from dgae_jax.study.trials import finished
@@ -132,7 +132,7 @@ def _page(tuning: Tuning, study: optuna.Study, best: list[FrozenTrial], cards: s
     seeds = f"{tuning.seeds} seeds from {FIRST_SEED}" if tuning.seeds > 1 else f"seed {FIRST_SEED}"
     what = f"{config.task}, {config.algo} on {config.physics}: {len(trials)} trials of {config.total_steps:,} steps, {seeds}"
     searched = ", ".join(f"{path} {dimension}" for path, dimension in tuning.space.items())
-    measure = f"{TARGET} of {so_many_episodes(tuning.options.episodes)} per seed in Gymnasium, of the policy at the end"
+    measure = f"{TARGET} of {counted(tuning.options.episodes, 'episode')} per seed in Gymnasium, of the policy at the end"
     command = f"dgae train --config {tuning.directory / 'best.json'}"
     return (
         f'<!DOCTYPE html><html lang="en"><meta charset="utf-8"><meta name="viewport" content="width=device-width, initial-scale=1">'
