@@ -45,7 +45,7 @@ class Group:
 
 
 def groups_of(rows: Iterable[Row]) -> list[Group]:
-    """All groups, by task and algorithm in the order of their tables, then by the name of their first cell."""
+    """All groups, by task and algorithm in the order of their tables, then as the study has them."""
     by_kind: dict[tuple[str, str], dict[tuple[str | None, str], list[Row]]] = {}
     for row in sorted(rows, key=order):
         by_kind.setdefault((row.task, row.algo), {}).setdefault((row.variant, row.hash), []).append(row)
@@ -76,10 +76,10 @@ def shown(value: Any) -> str:
 
 
 def order(row: Row) -> tuple:
-    """What rows are sorted by: task, algorithm, cell, seed."""
+    """What rows are sorted by: task, algorithm, seed; what is alike in these stays as the study has it."""
     tasks = list(TASKS)
     place = tasks.index(row.env) if row.env in tasks else len(tasks)
-    return place, row.task, list(TABLE).index(row.algo), row.cell, row.seed
+    return place, row.task, list(TABLE).index(row.algo), row.seed
 
 
 def _variant(first: Row, other: Row, number: int, most: int = 3) -> str:

@@ -26,10 +26,15 @@ def test_groups_come_by_task_and_algorithm_however_the_rows_finished(grouped):
 
 
 def test_other_settings_of_an_algorithm_are_a_group_of_their_own_that_says_what_differs(grouped):
-    rows = plain([1, 2])
-    first, second = grouped([*with_setting(plain([5]), target="bellman", quantiles=8), *rows])
+    first, second = grouped([*plain([1, 2]), *with_setting(plain([5]), target="bellman", quantiles=8)])
     assert (first.name, first.finals.tolist()) == ("DPPO", [1, 2])
     assert (second.name, second.finals.tolist(), second.number) == ("DPPO (critic.target bellman, critic.quantiles 8)", [5], 1)
+
+
+def test_groups_of_an_algorithm_stand_as_in_the_study_and_their_rows_by_seed(grouped):
+    wide, plainly = with_setting(plain([7, 8]), quantiles=8), plain([1, 2])
+    first, second = grouped([wide[1], wide[0], plainly[1], plainly[0]])
+    assert (first.finals.tolist(), second.finals.tolist()) == ([7, 8], [1, 2])
 
 
 def test_the_pairs_are_the_papers():
