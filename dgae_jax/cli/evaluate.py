@@ -15,6 +15,7 @@ from dgae_jax.cli.arguments import fail, parse
 from dgae_jax.cli.source import config_of
 from dgae_jax.configs.config import ConfigError, invalid
 from dgae_jax.run import files, terminal
+from dgae_jax.run.engines import engine_of
 from dgae_jax.run.options import WHOLE, RunOptions
 
 PURPOSE = "Evaluate the deterministic policy of a trained run."
@@ -81,7 +82,7 @@ def _evaluate(arguments: Arguments) -> int:
     from dgae_jax.run.progress import Reporter
     from dgae_jax.run.summary import describe
 
-    engine = arguments.engine or evaluation.engines_of(config)[0]
+    engine = engine_of(config, arguments.engine)
     out = arguments.out or evaluation.default_path(arguments.run_dir, engine, arguments.checkpoint)
     if not os.access(out.absolute().parent, os.W_OK):
         raise invalid("out", out, "a file that can be written")

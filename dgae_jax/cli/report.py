@@ -37,7 +37,7 @@ class Arguments:
     """Film a typical run of each task for the page: of the best algorithm, the seed in the middle; they stay in STUDY/videos."""
     markdown: Path | None = None
     """A Markdown file in which the tables between `<!-- dgae report: NAME -->` and `<!-- /dgae report -->` are replaced; NAME is
-    returns, attribution, reach or speed [path]."""
+    returns, attribution, risk, reach or speed [path]."""
 
 
 def main() -> int:

@@ -70,8 +70,9 @@ def parsed(argv: list[str]) -> tuple[Config, RunOptions]:
     config = _start(given)
     options = manifest.options(Path(given["resume"])) if given["resume"] else RunOptions()
     arguments = parse(Arguments, PURPOSE, argv, Arguments(settings=config, run=options), EXAMPLES, NOTE)
-    validate_options(arguments.run)
-    return validate(arguments.settings), arguments.run
+    config = validate(arguments.settings)
+    validate_options(arguments.run, config)
+    return config, arguments.run
 
 
 def _start(given: dict[str, str | None]) -> Config:

@@ -16,7 +16,8 @@ from dgae_jax.configs.config import Config, ConfigError
 from dgae_jax.export.outside import policy as outside
 from dgae_jax.learn.normalizers import OBSERVATION_LIMIT
 from dgae_jax.run.api import Policy
-from dgae_jax.run.evaluation import referee, time_limit
+from dgae_jax.run.engines import referee
+from dgae_jax.run.evaluation import time_limit
 from dgae_jax.run.restore import Trained
 
 Arrays = dict[str, np.ndarray]

@@ -7,7 +7,7 @@ import numpy as np
 
 from dgae_jax.configs.config import Config
 from dgae_jax.export.facts import Facts
-from dgae_jax.run.evaluation import engines_of, referee
+from dgae_jax.run.engines import engines_of, referee
 
 LICENCE = "Apache-2.0"
 """Of dgae_jax, and so of the programs that are copied beside a policy."""

@@ -17,7 +17,8 @@ from dgae_jax.maths.transport import directional_metric
 from dgae_jax.run import restore
 from dgae_jax.run.api import Policy
 from dgae_jax.run.calibration import LONGEST, steps_that_count
-from dgae_jax.run.evaluation import episode_seeds, referee
+from dgae_jax.run.engines import referee
+from dgae_jax.run.evaluation import episode_seeds
 
 
 class Actor(NamedTuple):

@@ -36,9 +36,9 @@ def estimate(statistic, *samples: statistics.Strata) -> Estimate:
     return Estimate(float(statistic(*samples)), statistics.interval(statistic, *samples))
 
 
-def interquartile_mean(group: Group) -> Estimate:
-    """Of the final returns."""
-    return estimate(statistics.interquartile_mean, [group.finals])
+def interquartile_mean(scores: np.ndarray) -> Estimate:
+    """Of scores [S]."""
+    return estimate(statistics.interquartile_mean, [scores])
 
 
 def pairs() -> Iterator[tuple[str, str]]:

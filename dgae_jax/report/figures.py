@@ -68,7 +68,7 @@ def final_returns(groups: Iterable[Group]) -> Figure:
     groups = list(groups)
 
     def panel(axes: Axes, task: str, members: Sequence[Group]) -> None:
-        marks = [Mark(g.name, look(g.algo, g.number), analysis.interquartile_mean(g), g.finals) for g in members]
+        marks = [Mark(g.name, look(g.algo, g.number), analysis.interquartile_mean(g.finals), g.finals) for g in members]
         _dots(axes, marks)
         axes.set(title=task, xlabel="return of the last policy")
 

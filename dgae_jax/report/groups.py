@@ -39,6 +39,11 @@ class Group:
         return np.array([row.final for row in self.rows])
 
     @property
+    def worst(self) -> np.ndarray:
+        """[S] mean returns of the worst quarter of their episodes."""
+        return np.array([row.worst for row in self.rows])
+
+    @property
     def curve(self) -> tuple[np.ndarray, np.ndarray]:
         """Steps [P] that all seeds cover and the episode returns [S, P] there while training."""
         return statistics.common_curve([(row.curve_steps, row.curve_returns) for row in self.rows])

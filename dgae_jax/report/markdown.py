@@ -13,7 +13,7 @@ from dgae_jax.report.groups import Group
 from dgae_jax.run import files
 
 TABLES: dict[str, Callable[[Sequence[Group]], tables.Table]] = {
-    "returns": tables.returns, "attribution": tables.attribution, "reach": tables.reach, "speed": tables.speed
+    "returns": tables.returns, "attribution": tables.attribution, "risk": tables.risk, "reach": tables.reach, "speed": tables.speed
 }  # fmt: skip
 
 _MARKER = re.compile(r"^<!-- (?:dgae report: (?P<name>.*?)|(?P<end>/dgae report)) -->$", re.MULTILINE)

@@ -15,6 +15,7 @@ import numpy as np
 from dgae_jax.configs.algorithms import TABLE
 from dgae_jax.configs.config import ConfigError
 from dgae_jax.run import files
+from dgae_jax.run.summary import mean_of_worst
 
 RESULTS = "results.jsonl"
 
@@ -37,6 +38,8 @@ class Row:
     """Where the policy was evaluated."""
     final: float
     """Mean return of the last policy over its episodes."""
+    worst: float
+    """Mean return of the worst quarter of them."""
     best: float | None
     """Mean return of the best of the policies that were evaluated along the way; None if none was."""
     best_steps: int | None
@@ -140,13 +143,14 @@ def _list(test: Callable[[Any], bool]) -> Callable[[Any], bool]:
     return lambda value: isinstance(value, list) and all(map(test, value))
 
 
+_numbers = _list(_number)
 _TEXT, _TEXT_OR_NONE = (_is(str), "a string"), (_is(str, type(None)), "a string or null")
 _WHOLE, _NUMBER, _OBJECT = (_is(int), "a whole number"), (_number, "a number"), (_is(dict), "an object")
 
 FIELDS = {
     "cell": _TEXT, "env": _TEXT, "env_version": _TEXT_OR_NONE, "algo": (TABLE.__contains__, f"one of {', '.join(TABLE)}"),
     "variant": _TEXT_OR_NONE, "seed": _WHOLE, "total_steps": _WHOLE, "hash": _TEXT, "final": _OBJECT, "final.engine": _TEXT,
-    "final.return_mean": _NUMBER,
+    "final.return_mean": _NUMBER, "final.returns": (lambda value: _numbers(value) and bool(value), "a list of numbers, one at least"),
     "best": (_is(dict, type(None)), "an object or null"), "curve": _OBJECT,
     "curve.steps": (_list(_is(int)), "a list of whole numbers"),
     "curve.return": (_list(lambda value: value is None or _number(value)), "a list of numbers, null where there is none"),
@@ -171,6 +175,7 @@ def _row(data: dict[str, Any], where: str) -> Row:
         **{name: found[name] for name in same},
         engine=found["final.engine"],
         final=float(found["final.return_mean"]),
+        worst=mean_of_worst(np.array(found["final.returns"]), 0.25),
         best=best.get("best.return_mean"),
         best_steps=best.get("best.steps"),
         curve_steps=steps,

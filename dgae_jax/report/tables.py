@@ -32,7 +32,7 @@ def returns(groups: Iterable[Group]) -> Table:
 def _returns(group: Group) -> tuple[str, ...]:
     best = [row.best for row in group.rows if row.best is not None]
     return (
-        group.task, group.name, str(len(group.rows)), spread(group.finals), between(analysis.interquartile_mean(group)),
+        group.task, group.name, str(len(group.rows)), spread(group.finals), between(analysis.interquartile_mean(group.finals)),
         spread(best) if best else NONE, " · ".join(number(value) for value in group.finals),
     )  # fmt: skip
 
@@ -40,12 +40,21 @@ def _returns(group: Group) -> tuple[str, ...]:
 def attribution(groups: Iterable[Group]) -> Table:
     """Final returns of variants, and the difference of their interquartile means from that of the first of the task."""
     rows = [
-        (group.task, group.name, str(len(group.rows)), spread(group.finals), between(analysis.interquartile_mean(group)),
+        (group.task, group.name, str(len(group.rows)), spread(group.finals), between(analysis.interquartile_mean(group.finals)),
          NONE if group is members[0] else _difference(members[0], group))
         for members in by_task(groups).values()
         for group in members
     ]  # fmt: skip
     return Table(("task", "variant", "seeds", "mean ± std", "IQM [95 %]", "difference from the first [95 %]"), rows)
+
+
+def risk(groups: Iterable[Group]) -> Table:
+    """Final returns: the mean over episodes, and the mean of their worst quarter (CVaR)."""
+    rows = []
+    for group in groups:
+        parts = [(spread(scores), between(analysis.interquartile_mean(scores))) for scores in (group.finals, group.worst)]
+        rows.append((group.task, group.name, str(len(group.rows)), *parts[0], *parts[1]))
+    return Table(("task", "variant", "seeds", "mean ± std", "IQM [95 %]", "worst quarter ± std", "IQM [95 %]"), rows)
 
 
 def reach(groups: Iterable[Group]) -> Table:
@@ -90,7 +99,7 @@ def comparison(first: Iterable[Group], second: Iterable[Group], names: tuple[str
     rows, either = [], {**ours, **theirs}
     for key in sorted(either, key=lambda key: order(either[key].rows[0])):
         both = [groups.get(key) for groups in (ours, theirs)]
-        cells = [NONE if group is None else between(analysis.interquartile_mean(group)) for group in both]
+        cells = [NONE if group is None else between(analysis.interquartile_mean(group.finals)) for group in both]
         rows.append((*key, *cells, _difference(*both)))
     return Table(("task", "algorithm", *(f"{name}, IQM [95 %]" for name in names), "difference [95 %]"), rows)
 

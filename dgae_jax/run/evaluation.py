@@ -12,28 +12,18 @@ import jax.numpy as jnp
 import numpy as np
 
 from dgae_jax.configs.build import make_greedy, make_task, make_trainer
-from dgae_jax.configs.config import Config, invalid
+from dgae_jax.configs.config import Config
 from dgae_jax.envs.registry import GIVEN, spec_of
 from dgae_jax.learn import play
 from dgae_jax.learn.parallel import Trainer
 from dgae_jax.learn.types import Fitted
 from dgae_jax.run import restore
 from dgae_jax.run.compiling import Watch, compile_aside, unwatched
+from dgae_jax.run.engines import engine_of, referee
 from dgae_jax.run.summary import counted, over_seeds, summary
 
 CHUNK = 50
 """Steps between looks at signals and clock."""
-
-
-def engines_of(config: Config) -> tuple[str, ...]:
-    """Where a run can be evaluated, the referee first: Gymnasium for our tasks and its own, the run's own physics for any other."""
-    spec = spec_of(config.env)
-    return ("gymnasium", *spec.engines) if spec.referees else spec.engines
-
-
-def referee(config: Config) -> str:
-    """Gymnasium's name of the task, or ours where Gymnasium does not play it."""
-    return spec_of(config.env).referee(config.env_version) or config.env
 
 
 def time_limit(config: Config) -> int:
@@ -77,7 +67,7 @@ def evaluate_run(
     run_dir: Path, config: Config, *, which: str, engine: str | None = None, episodes: int, seed: int = 0, watch: Watch = unwatched
 ) -> dict[str, Any]:
     """`evaluate_policies` for a run's newest checkpoint or the best of its evaluations; raises as it and `restore.trained`."""
-    _check_engine(config, engine)
+    engine = engine_of(config, engine)
     found = restore.trained(run_dir, config, which)
     result = evaluate_policies(found.policy, config, engine=engine, episodes=episodes, seed=seed, watch=watch)
     return {**result, "checkpoint": found.path.name}
@@ -91,8 +81,7 @@ def evaluate_policies(
     Every policy plays the same `episodes` initial states, which `seed` determines. `engine` is the first of `engines_of` unless
     another is named; raises ConfigError if it is none of them. May be broken off: it comes back to Python every `CHUNK` steps.
     """
-    _check_engine(config, engine)
-    engine = engine or engines_of(config)[0]
+    engine = engine_of(config, engine)
     run = _in_gymnasium if engine == "gymnasium" else _in_jax
     per_run, where = [], f"{referee(config)} ({engine})"
     for i in range(config.num_seeds):
@@ -108,11 +97,6 @@ def evaluate_policies(
         **(over_seeds(per_run) if len(per_run) > 1 else {}),
         "seeds": [{"seed": config.seed + i, **summary(returns)} for i, returns in enumerate(per_run)],
     }
-
-
-def _check_engine(config: Config, engine: str | None) -> None:
-    if engine is not None and engine not in engines_of(config):
-        raise invalid("engine", engine, f"one of {', '.join(engines_of(config))} with {config.env}")
 
 
 class _Progress(NamedTuple):

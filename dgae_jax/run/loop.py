@@ -55,7 +55,7 @@ def go_on(config: Config, options: RunOptions, heed: Heed = unheeded) -> Finishe
 
 def go_on_or_start(config: Config, options: RunOptions, heed: Heed = unheeded) -> Finished:
     """`go_on` in `options.run_dir` if a run was begun there, `start` otherwise; raises as they do."""
-    validate_options(options)
+    validate_options(options, validate(config))
     hosts.join(options)
     if options.run_dir is not None and hosts.first(directory.has_begun(options.run_dir)):
         return go_on(config, dataclasses.replace(options, resume=options.run_dir, run_dir=None, resume_or_start=False), heed)
@@ -95,7 +95,7 @@ def _exit_code(work: Callable[[Config, RunOptions], Finished], config: Config, o
 def _prepared(config: Config, options: RunOptions) -> tuple[Config, RunOptions]:
     """Configuration and options in full, after a look at everything that can be seen before work begins."""
     config = validate(config)
-    validate_options(options)
+    validate_options(options, config)
     devices = machine.use_devices(config, options)
     machine.use_cache(options.cache_dir)
     check_memory(config, make_task(config), machine.memory())

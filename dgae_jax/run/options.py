@@ -6,7 +6,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from dgae_jax.configs.config import ConfigError, invalid
+from dgae_jax.configs.config import Config, ConfigError, invalid
+from dgae_jax.run.engines import engine_of
 
 SINKS = {"tensorboard": "tensorboardX", "wandb": "wandb", "mlflow": "mlflow"}
 """Viewers of metrics that a run can feed, and the library that each takes."""
@@ -42,8 +43,11 @@ class RunOptions:
     """Let --resume continue with another --physics, device, number of cores or versions: the same in the statistical sense only."""
     max_nonfinite: int = 10
     """Failures in a row before the run is stopped: an update not finite and left out, or most world steps invalid [iterations]."""
+    engine: str | None = None
+    """Where policies are evaluated: gymnasium, whose task has no noise, or an engine as in --physics, with the noise of the
+    training; by default the first that the task has."""
     episodes: int = 20
-    """Episodes of every evaluation in Gymnasium, per run [episodes]."""
+    """Episodes of every evaluation, per run [episodes]."""
     debug_nonfinite: bool = False
     """Write the states and actions from which worlds turn non-finite to nonfinite/ in the run directory, for replay."""
     log: tuple[str, ...] = ()
@@ -65,8 +69,9 @@ WHOLE = {
 """Whole numbers: from, to, and why not more."""
 
 
-def validate_options(options: RunOptions) -> None:
-    """Raise `ConfigError` for the first option that is invalid."""
+def validate_options(options: RunOptions, config: Config) -> None:
+    """Raise `ConfigError` for the first option that is invalid, in a run of `config`."""
+    engine_of(config, options.engine)
     for name, (low, high, reason) in WHOLE.items():
         value = getattr(options, name)
         if value is not None and not low <= value <= high:
@@ -104,7 +109,7 @@ def _validate_log(names: tuple[str, ...]) -> None:
             raise ConfigError(f'log {name}: {SINKS[name]} is missing; pip install "dgae_jax[{name}]"', "log")
 
 
-_KEPT = ("devices", "checkpoint_every", "keep_checkpoints", "max_nonfinite", "episodes", "debug_nonfinite", "log")
+_KEPT = ("devices", "checkpoint_every", "keep_checkpoints", "max_nonfinite", "engine", "episodes", "debug_nonfinite", "log")
 """What a run goes on with when it is resumed."""
 
 
@@ -116,7 +121,7 @@ def to_dict(options: RunOptions) -> dict[str, Any]:
 def from_dict(data: Any) -> RunOptions:
     """What `to_dict` wrote; defaults for all else."""
     found = data if isinstance(data, dict) else {}
-    usual = to_dict(RunOptions(devices=1))
+    usual = to_dict(RunOptions(devices=1, engine=""))
     kept: dict[str, Any] = {name: found[name] for name in _KEPT if type(found.get(name)) is type(usual[name])}
     viewers: dict[str, Any] = {"log": [name for name in SINKS if name in kept.get("log", [])]}
     return RunOptions(**kept | viewers)

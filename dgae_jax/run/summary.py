@@ -12,18 +12,18 @@ from dgae_jax.maths.statistics import bootstrap_interval, iqm
 @np.errstate(invalid="ignore")  # a return that is not finite makes numbers that are not either
 def summary(returns: np.ndarray) -> dict[str, Any]:
     """Mean, standard deviation, tails and quantiles of returns [E], and each of them."""
-    worst_first = np.sort(returns)
-
-    def mean_of_worst(share: float) -> float:
-        return float(worst_first[: max(1, round(share * len(returns)))].mean())
-
     return {
         "return_mean": float(returns.mean()),
         "return_std": float(returns.std()),
-        "return_cvar": {str(share): mean_of_worst(share) for share in (0.05, 0.1, 0.25)},
+        "return_cvar": {str(share): mean_of_worst(returns, share) for share in (0.05, 0.1, 0.25)},
         "return_quantiles": {str(q): float(np.quantile(returns, q)) for q in (0.05, 0.25, 0.5, 0.75, 0.95)},
         "returns": [round(float(r), 4) for r in returns],
     }
+
+
+def mean_of_worst(returns: np.ndarray, share: float) -> float:
+    """CVaR: the mean of the lowest `share` of returns [E], of one at least."""
+    return float(np.sort(returns)[: max(1, round(share * len(returns)))].mean())
 
 
 def over_seeds(returns: list[np.ndarray]) -> dict[str, Any]:

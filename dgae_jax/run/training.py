@@ -18,7 +18,7 @@ from dgae_jax.learn.types import TrainState
 from dgae_jax.run import checkpoint, directory, files, hosts, manifest, terminal
 from dgae_jax.run.checkpoint import NotFiniteError
 from dgae_jax.run.compiling import compile_aside
-from dgae_jax.run.evaluation import engines_of, referee
+from dgae_jax.run.engines import engine_of, referee
 from dgae_jax.run.options import RunOptions
 from dgae_jax.run.progress import Reporter
 from dgae_jax.run.record import Record
@@ -159,7 +159,7 @@ def _evaluate(config: Config, options: RunOptions, record: Record, signals: Sign
     """The evaluation at the end, which may take longer than a short training."""
     with signals.may_stop(), Reporter(page=record.page) as reporter:
         episodes = counted(options.episodes, "episode") + (f" of each of {config.num_seeds} seeds" if config.num_seeds > 1 else "")
-        reporter.announce(f"evaluating {episodes} in {referee(config)} ({engines_of(config)[0]})")
+        reporter.announce(f"evaluating {episodes} in {referee(config)} ({engine_of(config, options.engine)})")
         return record.evaluate(hosts.whole(policies_of(state)), reporter.watch)
 
 

@@ -50,7 +50,8 @@ def train(tuning: Tuning, study: optuna.Study, trials: list[Trial], signals: Sig
         compile_aside(init, configs[0], keys)
         states = stacked([init(config, keys) for config in configs])  # one after the other: see parallel.in_turn
         compile_aside(step, settings, states)
-    evaluate = partial(evaluate_policies, config=configs[0], episodes=tuning.options.episodes)  # no trial's network differs in shape
+    options = tuning.options  # no trial's network differs in shape, so that one program evaluates them all
+    evaluate = partial(evaluate_policies, config=configs[0], engine=options.engine, episodes=options.episodes)
     every, results = quarter(configs[0]), [dict[str, Any]() for _ in trials]
     alive, total = set(range(len(trials))), configs[0].iterations
     for done in range(1, total + 1):

@@ -12,6 +12,7 @@ from matplotlib.ticker import MaxNLocator
 from optuna.trial import FrozenTrial
 
 from dgae_jax.run import files
+from dgae_jax.run.engines import engine_of
 from dgae_jax.run.summary import counted
 from dgae_jax.study.search import Range
 from dgae_jax.study.storage import unwarned
@@ -132,7 +133,8 @@ def _page(tuning: Tuning, study: optuna.Study, best: list[FrozenTrial], cards: s
     seeds = f"{tuning.seeds} seeds from {FIRST_SEED}" if tuning.seeds > 1 else f"seed {FIRST_SEED}"
     what = f"{config.task}, {config.algo} on {config.physics}: {len(trials)} trials of {config.total_steps:,} steps, {seeds}"
     searched = ", ".join(f"{path} {dimension}" for path, dimension in tuning.space.items())
-    measure = f"{TARGET} of {counted(tuning.options.episodes, 'episode')} per seed in Gymnasium, of the policy at the end"
+    where, episodes = engine_of(config, tuning.options.engine), counted(tuning.options.episodes, "episode")
+    measure = f"{TARGET} of {episodes} per seed in {where}, of the policy at the end"
     command = f"dgae train --config {tuning.directory / 'best.json'}"
     return (
         f'<!DOCTYPE html><html lang="en"><meta charset="utf-8"><meta name="viewport" content="width=device-width, initial-scale=1">'

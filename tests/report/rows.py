@@ -40,7 +40,10 @@ def row(env="hopper", algo="dppo", seed=0, **changes):
 
 def plain(scores, env="hopper", algo="dppo", **changes):
     """Rows with these final returns, one per seed, and nothing else of interest."""
-    return [row(env, algo, seed, **{"final": {"engine": "gymnasium", "return_mean": score}} | changes) for seed, score in enumerate(scores)]
+    return [
+        row(env, algo, seed, **{"final": {"engine": "gymnasium", "return_mean": score, "returns": [score]}} | changes)
+        for seed, score in enumerate(scores)
+    ]
 
 
 def study(directory, rows, planned=()):

@@ -19,9 +19,10 @@ def refusal(path):
 
 def test_a_row_is_what_the_file_says(tmp_path):
     curve = {"steps": [5, 10], "return": [None, 2.5]}
-    written = row("hopper", "ppo", 3, curve=curve, final={"engine": "gymnasium", "return_mean": 7}, seconds=9.5)
+    written = row("hopper", "ppo", 3, curve=curve, final={"engine": "gymnasium", "return_mean": 7, "returns": [9, 5]}, seconds=9.5)
     (read,) = results.read(study(tmp_path, [written])).rows
-    assert (read.cell, read.task, read.algo, read.seed, read.final, read.seconds) == ("hopper-ppo-3", "hopper-v4", "ppo", 3, 7.0, 9.5)
+    assert (read.cell, read.task, read.algo, read.seed, read.seconds) == ("hopper-ppo-3", "hopper-v4", "ppo", 3, 9.5)
+    assert (read.final, read.worst) == (7.0, 5.0)
     np.testing.assert_array_equal(read.curve_steps, [5, 10])
     np.testing.assert_array_equal(read.curve_returns, [np.nan, 2.5])
     assert (read.best, read.best_steps, read.config) == (written["best"]["return_mean"], 800_000, written["config"])
@@ -81,6 +82,7 @@ def test_a_seed_that_is_there_twice_is_refused(tmp_path):
         ({"final": None}, "final: must be an object"),
         ({"final": {"engine": "gymnasium"}}, "final.return_mean: missing"),
         ({"final": {"engine": "gymnasium", "return_mean": float("nan")}}, "final.return_mean: must be a number"),
+        ({"final": {"engine": "gymnasium", "return_mean": 1, "returns": []}}, "final.returns: must be a list of numbers, one at least"),
         ({"best": {"steps": 5}}, "best.return_mean: missing"),
         ({"best": 3}, "best: must be an object or null"),
         ({"curve": {"steps": [1, 2], "return": [1.0]}}, "curve: must have increasing steps and a return for each"),

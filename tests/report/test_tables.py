@@ -58,6 +58,12 @@ def test_variants_are_named_and_compared_with_the_first_of_their_task_noise_maki
     ]
 
 
+def test_the_risk_of_a_policy_is_the_mean_of_the_worst_quarter_of_its_episodes(grouped):
+    final = {"engine": "native", "return_mean": 7.75}
+    rows = plain([0], final=final | {"returns": [11, 3, 9, 10, 5, 8, 7, 9]}) + plain([0, 0], final=final | {"returns": [8]})[1:]
+    assert tables.risk(grouped(rows)).rows == [("hopper-v4", "DPPO", "2", "8 ± 0", "8 [8, 8]", "6 ± 3", "6 [4, 8]")]
+
+
 def test_markdown_has_numbers_to_the_right_and_no_bars_inside_cells():
     table = tables.Table(("task", "algorithm", "x"), [("a|b", "PPO", "1")])
     assert tables.markdown(table) == "| task | algorithm | x |\n| --- | --- | ---: |\n| a\\|b | PPO | 1 |"
@@ -94,7 +100,7 @@ def test_every_block_of_a_document_is_replaced_and_the_rest_stays(grouped, tmp_p
         ("<!-- dgae report: returns -->\n<!-- dgae report: speed -->\n<!-- /dgae report -->",
          "a file with <!-- /dgae report --> after the table returns"),
         ("<!-- /dgae report -->\n", "a file without <!-- /dgae report --> where no table begins"),
-        ("<!-- dgae report: x -->\n<!-- /dgae report -->", "a file with tables named returns, attribution, reach, speed, not x"),
+        ("<!-- dgae report: x -->\n<!-- /dgae report -->", "a file with tables named returns, attribution, risk, reach, speed, not x"),
     ],
 )  # fmt: skip
 def test_markers_that_do_not_match_are_refused(text, sentence, tmp_path):

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from dgae_jax.configs.build import make_greedy, make_task
-from dgae_jax.configs.config import ConfigError
+from dgae_jax.configs.config import ConfigError, NoiseConfig
 from dgae_jax.run import api, directory, restore
 from dgae_jax.run import record as record_module
 from dgae_jax.run.api import load_policy, train
@@ -48,11 +48,19 @@ def test_a_run_with_a_directory_is_that_of_the_command_line_and_goes_on_if_asked
     assert directory.read_config(run_dir).total_steps == longer.total_steps
 
 
+def test_a_run_is_evaluated_where_asked_to_and_in_an_engine_of_ours_with_the_noise_of_the_training():
+    config = dataclasses.replace(small(), noise=NoiseConfig(reward=100.0))
+    noisy, calm = (train(config, quiet=True, engine=engine, **CHOSEN).evaluation for engine in ("native", "gymnasium"))
+    assert (noisy["engine"], calm["engine"]) == ("native", "gymnasium")
+    assert abs(noisy["return_mean"]) > 100 > calm["return_mean"] > 0  # of an episode of some ten steps, each with a reward of 1 or 2
+
+
 @pytest.mark.parametrize(
     ("config", "options", "message"),
     [
         (dataclasses.replace(small(), gamma=1.5), {}, "gamma 1.5: must be"),
         (small(), {"episodes": 0}, "episodes 0: must be"),
+        (small(), {"engine": "mujoco"}, "engine mujoco: must be one of gymnasium, "),
         (small(), {"episode": 3}, "episode: must be one of cache_dir, "),
         (small(), {"resume": "x"}, "resume: must be one of cache_dir, "),
     ],

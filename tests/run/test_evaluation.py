@@ -8,7 +8,8 @@ import pytest
 import dgae_jax as dg
 from dgae_jax.configs.build import make_task, make_trainer, policies_of, seed_keys
 from dgae_jax.configs.config import ConfigError
-from dgae_jax.run.evaluation import default_path, engines_of, episode_seeds, evaluate_policies
+from dgae_jax.run.engines import engines_of
+from dgae_jax.run.evaluation import default_path, episode_seeds, evaluate_policies
 from dgae_jax.run.evaluations import EvaluationsFile
 from dgae_jax.run.summary import describe, over_seeds, summary
 from tests.runs import SMALL

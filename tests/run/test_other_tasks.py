@@ -12,7 +12,8 @@ from numpy.testing import assert_array_equal
 import dgae_jax as dg
 from dgae_jax.configs.config import ConfigError, resolve
 from dgae_jax.run import loop, restore
-from dgae_jax.run.evaluation import engines_of, time_limit
+from dgae_jax.run.engines import engines_of
+from dgae_jax.run.evaluation import time_limit
 from dgae_jax.run.options import RunOptions
 from tests.helpers import command
 from tests.probes import Counter, Target

@@ -261,14 +261,14 @@ def test_how_far_a_viewer_has_come_may_be_any_file_and_then_says_nothing(data, t
 )
 def test_a_viewer_that_is_unknown_or_named_twice_is_refused(log, message):
     with pytest.raises(ConfigError, match=message):
-        validate_options(RunOptions(log=log))
+        validate_options(RunOptions(log=log), SMALL)
 
 
 @pytest.mark.parametrize("name", SINKS)
 def test_a_missing_library_is_refused_with_what_to_install(name, monkeypatch):
     monkeypatch.setattr(importlib.util, "find_spec", lambda _: None)
     with pytest.raises(ConfigError, match=rf'log {name}: {SINKS[name]} is missing; pip install "dgae_jax\[{name}\]"'):
-        validate_options(RunOptions(log=(name,)))
+        validate_options(RunOptions(log=(name,)), SMALL)
 
 
 def test_a_folder_of_its_name_is_not_a_library(tmp_path, monkeypatch):
@@ -276,7 +276,7 @@ def test_a_folder_of_its_name_is_not_a_library(tmp_path, monkeypatch):
     monkeypatch.syspath_prepend(tmp_path)
     monkeypatch.setitem(SINKS, "wandb", "a_viewer_s_folder")
     with pytest.raises(ConfigError, match="a_viewer_s_folder is missing"):
-        validate_options(RunOptions(log=("wandb",)))
+        validate_options(RunOptions(log=("wandb",)), SMALL)
 
 
 def test_a_run_goes_on_with_its_viewers_and_a_list_is_as_good_as_a_tuple(run_dir):

@@ -1,0 +1,22 @@
+"""Where a policy can be evaluated."""
+
+from dgae_jax.configs.config import Config, invalid
+from dgae_jax.envs.registry import spec_of
+
+
+def engines_of(config: Config) -> tuple[str, ...]:
+    """Where a run can be evaluated, the referee first: Gymnasium for our tasks and its own, the run's own physics for any other."""
+    spec = spec_of(config.env)
+    return ("gymnasium", *spec.engines) if spec.referees else spec.engines
+
+
+def engine_of(config: Config, engine: str | None) -> str:
+    """The engine of that name, the first of `engines_of` where there is none; raises ConfigError if the run cannot have it."""
+    if engine is not None and engine not in engines_of(config):
+        raise invalid("engine", engine, f"one of {', '.join(engines_of(config))} with {config.env}")
+    return engine or engines_of(config)[0]
+
+
+def referee(config: Config) -> str:
+    """Gymnasium's name of the task, or ours where Gymnasium does not play it."""
+    return spec_of(config.env).referee(config.env_version) or config.env
