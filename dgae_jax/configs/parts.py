@@ -28,7 +28,7 @@ class Part:
 DESCENT = {"optimizer": "adam", "learning_rate": 3e-4, "learning_rate_end": 0.0, "epochs": 10, "minibatches": 32, "max_grad_norm": 0.5}
 """Settings of gradient descent by minibatches, which fits every critic and most policies."""
 
-_TRUST_REGION = {"radius": 0.01, "damping": 0.1, "cg_iterations": 10, "backtracks": 10, "fisher_every": 1}
+_TRUST_REGION = {"radius": 0.01, "learning_rate_end": 1.0, "damping": 0.1, "cg_iterations": 10, "backtracks": 10, "fisher_every": 1}
 
 UPDATES = {
     "clip": Part("dgae_jax.learn.updates:clipped", {"clip": 0.2, **DESCENT}),

@@ -22,7 +22,7 @@ def _tuned(update: str, critic: str, env: str) -> list[Settings]:
         },
         "trust-region": {
             "gamma": 0.995,  # at 0.99 some seeds of Hopper hop faster and faster, and fall
-            "policy": {"initial_std": 1.0, "radius": 0.03, "damping": 0.3, "cg_iterations": 25},
+            "policy": {"initial_std": 1.0, "radius": 0.03, "learning_rate_end": 0.0, "damping": 0.3, "cg_iterations": 25},
             "critic": {"learning_rate": 1e-3, "learning_rate_end": 1.0, "epochs": 20, "minibatches": 16},
         },
     }

@@ -73,29 +73,30 @@ def sgd(loss: Loss, optimizer: optax.GradientTransformation, *, epochs: int, min
 
 
 def trust_region(
-    policy: Policy, loss: Loss, *, radius: ArrayLike, damping: ArrayLike, cg_iterations: int, backtracks: int, fisher_every: int
+    policy: Policy, loss: Loss, *, radius: optax.Schedule, damping: ArrayLike, cg_iterations: int, backtracks: int, fisher_every: int
 ) -> Update:
     """The natural gradient step to a KL radius, halved until KL and loss accept it (TRPO, Schulman et al. 2015).
 
     The direction solves (F + damping) x = −∇loss by `cg_iterations` of conjugate gradient, with the Fisher matrix F of every
-    `fisher_every`-th sample. A step is taken only if KL(old ‖ new) ≤ `radius` and the loss falls; if none of 1 + `backtracks`
-    lengths is such a step, the parameters stay as they are, bit for bit. As in the paper of TRPO the divergence is that of the
-    whole action, summed over its A dimensions; where it is averaged over them (sb3-contrib), radius and damping are ours over A.
+    `fisher_every`-th sample. A step is taken only if KL(old ‖ new) ≤ `radius` of the number of steps before and the loss falls; if
+    none of 1 + `backtracks` lengths is such a step, the parameters stay as they are, bit for bit. As in the paper of TRPO the
+    divergence is that of the whole action, summed over its A dimensions; where it is averaged over them (sb3-contrib), radius and
+    damping are ours over A.
     """
 
     def step(key: jax.Array, fit: Fit, batch: Batch):
-        old, batch = fit.params, devices.divide(batch)
+        old, batch, within = fit.params, devices.divide(batch), radius(fit.opt_state)
         (start, info), gradient = jax.value_and_grad(loss, has_aux=True)(old, batch)
         fisher = fisher_product(policy, old, batch.obs[::fisher_every], damping)
         direction, _ = jax.scipy.sparse.linalg.cg(fisher, jax.tree.map(jnp.negative, gradient), maxiter=cg_iterations, tol=1e-10)
         curvature = optax.tree.vdot(direction, fisher(direction))
-        longest = jnp.sqrt(2 * radius / curvature)
+        longest = jnp.sqrt(2 * within / curvature)
 
         def attempt(halvings):
             new = jax.tree.map(lambda p, d: p + longest * 0.5**halvings * d, old, direction)
             moved = gaussian.kl(policy.apply(old, batch.obs), policy.apply(new, batch.obs)).mean()
             value, info = loss(new, batch)
-            return new, value, moved, (moved <= radius) & (value < start), info["entropy"]
+            return new, value, moved, (moved <= within) & (value < start), info["entropy"]
 
         def search(carry):
             halvings, _ = carry
@@ -116,9 +117,9 @@ def trust_region(
             "accepted": accepted.astype(start.dtype),
             "halvings": halvings.astype(start.dtype),
         }
-        return Fit(params, fit.opt_state), info
+        return Fit(params, fit.opt_state + 1), info
 
-    return Update(lambda params: (), step)
+    return Update(lambda params: jnp.int32(0), step)
 
 
 def fisher_product(policy: Policy, params: Params, obs: Array, damping: ArrayLike) -> Callable[[Params], Params]:
@@ -144,17 +145,19 @@ def rmsprop(rate) -> optax.GradientTransformation:
     return optax.rmsprop(rate, decay=0.99, eps=1e-5, eps_in_sqrt=False)
 
 
-def descent(optimizer: Callable, learning_rate, *, final_fraction, gradient_steps, max_norm) -> optax.GradientTransformation:
-    """An optimizer behind a global-norm clip, its rate falling linearly to `final_fraction` of its start over `gradient_steps`.
-
-    All four numbers may be traced.
-    """
+def falling(start: ArrayLike, final_fraction: ArrayLike, steps: ArrayLike) -> optax.Schedule:
+    """From `start` linearly to `final_fraction` of it over so many steps, constant then; all three may be traced."""
 
     def schedule(count: ArrayLike) -> Array:
-        done = jnp.minimum(jnp.divide(count, gradient_steps), 1.0)
-        return learning_rate * (1 + (final_fraction - 1) * done)
+        done = jnp.minimum(jnp.divide(count, steps), 1.0)
+        return start * (1 + (final_fraction - 1) * done)
 
-    return optax.chain(optax.clip_by_global_norm(max_norm), optimizer(schedule))
+    return schedule
+
+
+def descent(optimizer: Callable, learning_rate, *, final_fraction, gradient_steps, max_norm) -> optax.GradientTransformation:
+    """An optimizer behind a global-norm clip, its rate `falling` over `gradient_steps`."""
+    return optax.chain(optax.clip_by_global_norm(max_norm), optimizer(falling(learning_rate, final_fraction, gradient_steps)))
 
 
 def descend(
@@ -176,6 +179,6 @@ def policy_gradient(policy: Policy, iterations: ArrayLike, **fit) -> Update:
     return descend(surrogate(policy), iterations, **fit)
 
 
-def natural_gradient(policy: Policy, iterations: ArrayLike, **search) -> Update:
-    """TRPO: a natural gradient step on the surrogate within a trust region."""
-    return trust_region(policy, surrogate(policy), **search)
+def natural_gradient(policy: Policy, iterations: ArrayLike, *, radius: ArrayLike, learning_rate_end: ArrayLike, **search) -> Update:
+    """TRPO: a natural gradient step on the surrogate within a trust region, whose radius falls over a run of `iterations`."""
+    return trust_region(policy, surrogate(policy), radius=falling(radius, learning_rate_end, iterations), **search)

@@ -10,7 +10,7 @@ from numpy.testing import assert_allclose
 
 from dgae_jax.learn.networks import SharedCovariance, gaussian_policy
 from dgae_jax.learn.types import Batch, Fit
-from dgae_jax.learn.updates import fisher_product, surrogate, trust_region
+from dgae_jax.learn.updates import fisher_product, natural_gradient, surrogate, trust_region
 from dgae_jax.maths import gaussian
 from tests.helpers import distance
 
@@ -31,9 +31,11 @@ def example(seed=0, count=200):
     )
 
 
-def update(loss=None, **changes):
-    settings = {"radius": 0.01, "damping": 0.1, "cg_iterations": 30, "backtracks": 10, "fisher_every": 1, **changes}
-    return trust_region(POLICY, loss or surrogate(POLICY), **settings)
+SEARCH = {"damping": 0.1, "cg_iterations": 30, "backtracks": 10, "fisher_every": 1}
+
+
+def update(loss=None, radius=0.01, **changes):
+    return trust_region(POLICY, loss or surrogate(POLICY), radius=lambda steps: radius, **{**SEARCH, **changes})
 
 
 def move(step, params, batch):
@@ -166,3 +168,15 @@ def test_sb3_contribs_radius_and_damping_are_ours_over_the_number_of_action_dime
     assert np.linalg.norm(ours - theirs) < 1e-3 * np.linalg.norm(theirs)
     unscaled = step_of_sb3_contrib(params, batch, actions * radius, actions * damping)
     assert np.linalg.norm(ours - unscaled) > 0.1 * np.linalg.norm(theirs)
+
+
+def test_the_radius_falls_from_step_to_step_over_a_run():
+    params, batch = example()
+    rule = natural_gradient(POLICY, 4, radius=0.01, learning_rate_end=0.0, **SEARCH)
+    fit, moved = Fit(params, rule.init(params)), []
+    for _ in range(4):  # always from the same policy, that which acted
+        fit, info = jax.jit(rule.step)(jax.random.key(0), fit._replace(params=params), batch)
+        moved.append(float(info["kl"]))
+    assert int(fit.opt_state) == 4
+    # a step that is not halved has the divergence radius up to third order, so that the ratios are those of 4, 3, 2 and 1
+    assert_allclose(np.array(moved) / moved[0], [1, 3 / 4, 2 / 4, 1 / 4], rtol=0.05)
