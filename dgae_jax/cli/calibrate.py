@@ -37,13 +37,14 @@ class Arguments:
     seed: int = 0
     """Seed of the episodes [1]."""
     out: Path | None = None
-    """PNG with a histogram per run; by default calibration.png in the directory of the first [path]."""
+    """PNG with a histogram per run, and their statistics in a JSON file of the same name; by default calibration.png in the directory
+    of the first [path]."""
     cache_dir: str = RunOptions.cache_dir
     """Where compiled programs are kept between runs; none disables [path]."""
 
 
 def main() -> int:
-    """Write calibration.json into every run directory, and one picture; 0 done, 2 bad input, 130 stopped by SIGINT."""
+    """Write one picture and the statistics of all runs; 0 done, 2 bad input, 130 stopped by SIGINT."""
     terminal.prepare()
     try:
         arguments = parse(Arguments, PURPOSE, examples=EXAMPLES)
@@ -59,6 +60,9 @@ def _checked(arguments: Arguments) -> dict[Path, Config]:
     """The runs; raises ConfigError for the first thing that is invalid."""
     if not arguments.run_dirs:
         raise ConfigError("RUN_DIRS: must be one run directory or more (--help lists every flag)")
+    names = [path.resolve().name for path in arguments.run_dirs]
+    if len(set(names)) < len(names):
+        raise ConfigError(f"RUN_DIRS {' '.join(names)}: must be directories of different names, by which their statistics are known")
     runs = {path: resolve(directory.read_config(path)) for path in arguments.run_dirs}
     for path, config in runs.items():
         if config.critic.kind != "quantile":
@@ -67,8 +71,8 @@ def _checked(arguments: Arguments) -> dict[Path, Config]:
             raise invalid("index", arguments.index, f"a whole number from 0 to {config.num_seeds - 1}, the index of a seed in {path}")
     if not 0 <= arguments.seed < 2**31:
         raise invalid("seed", arguments.seed, f"a whole number from 0 to {2**31 - 1:,} (an int32)")
-    if arguments.out and not arguments.out.absolute().parent.is_dir():
-        raise invalid("out", arguments.out, "a file in a directory that exists")
+    if arguments.out and not (arguments.out.suffix == ".png" and arguments.out.absolute().parent.is_dir()):
+        raise invalid("out", arguments.out, "a file whose name ends in .png, in a directory that exists")
     return runs
 
 
@@ -83,7 +87,6 @@ def _calibrate(arguments: Arguments, runs: dict[Path, Config]) -> int:
     for path, config in runs.items():
         with Reporter() as reporter:
             result = calibration.calibrate(path, config, **how, watch=reporter.watch)
-        _write(path / "calibration.json", lambda to, result=result: files.write_json(to, result))
         found[path.resolve().name] = str(config.algo), result
         terminal.say(
             f"{path.resolve().name}: {100 * result['coverage_90']:.0f} % of the returns in the central 90 %, "
@@ -91,7 +94,9 @@ def _calibrate(arguments: Arguments, runs: dict[Path, Config]) -> int:
         )
     out = arguments.out or arguments.run_dirs[0] / "calibration.png"
     _write(out, lambda to: curve.save(picture.histograms(found), to))
-    terminal.say(f"written {out}, and calibration.json beside each run")
+    statistics = {name: result for name, (_, result) in found.items()}
+    _write(out.with_suffix(".json"), lambda to: files.write_json(to, statistics))
+    terminal.say(f"written {out} and {out.with_suffix('.json').name}")
     return 0
 
 

@@ -63,12 +63,21 @@ def test_what_cannot_be_compared_is_refused_in_one_line(changes, message, tmp_pa
     assert message in capsys.readouterr().err
 
 
+def test_runs_of_the_same_name_are_refused(tmp_path, monkeypatch, capsys):
+    for parent in ("a", "b"):
+        directory.create(tmp_path / parent / "run", runs.small("dppo"), runs.QUIET)
+    monkeypatch.setattr("sys.argv", ["dgae calibrate", *(str(tmp_path / parent / "run") for parent in ("a", "b"))])
+    with pytest.raises(SystemExit, match="2"):
+        helpers.command("calibrate")()
+    assert "RUN_DIRS run run: must be directories of different names" in capsys.readouterr().err
+
+
 @pytest.mark.slow  # a program of its own is compiled
-def test_the_command_writes_statistics_beside_every_run_and_a_picture(tmp_path, monkeypatch, capsys):
+def test_the_command_writes_the_statistics_of_every_run_and_a_picture(tmp_path, monkeypatch, capsys):
     loop.start(runs.small("dppo"), dataclasses.replace(runs.QUIET, run_dir=tmp_path / "run"))
     monkeypatch.setattr("sys.argv", ["dgae calibrate", str(tmp_path / "run"), "--cache-dir", runs.QUIET.cache_dir])
     assert helpers.command("calibrate")() == 0
-    found = json.loads((tmp_path / "run" / "calibration.json").read_text())
+    found = json.loads((tmp_path / "run" / "calibration.json").read_text())["run"]
     assert found["samples"] == calibration.WORLDS * calibration.CHUNK  # episodes of 20 steps, in whole chunks
     assert np.isfinite([*found["pit"], found["rmse"], found["crps"], *found["similar_means"].values()]).all()
     assert (tmp_path / "run" / "calibration.png").read_bytes().startswith(b"\x89PNG")
