@@ -61,8 +61,8 @@ class FitConfig(_Settings):
     learning_rate: float | None = None
     """Learning rate at the start [1]."""
     learning_rate_end: float | None = None
-    """Learning rate, or a trust region's radius, at the end of the run as a fraction of its start: 1 constant, 0 linear decay to
-    zero [1]."""
+    """Learning rate at the end of the run as a fraction of its start: 1 constant, 0 linear decay to zero; a trust region's radius
+    decays in the last fifth of the run [1]."""
     epochs: int | None = None
     """Passes over each rollout [1]."""
     minibatches: int | None = None

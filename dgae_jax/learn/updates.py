@@ -21,6 +21,10 @@ LOG_RATIO_LIMIT = 20.0
 PPO's clip and TRPO's radius act at ratios near 1, so nothing changes there; float32 overflows at log ρ = 88.7.
 """
 
+STEADY = 0.8
+"""Share of a run after which the radius of a trust region falls, if it does: a smaller one from the start learns less, and what it is
+to prevent, that the last step is one too far, is a matter of the end (docs/decisions.md)."""
+
 
 def surrogate(policy: Policy, clip: ArrayLike = jnp.inf) -> Loss:
     """−E[min(ρA, clip(ρ, 1 ± ε)A)], ρ = π(a|s)/π_old(a|s) (Schulman et al. 2017); without a clip, plain ρA.
@@ -145,11 +149,14 @@ def rmsprop(rate) -> optax.GradientTransformation:
     return optax.rmsprop(rate, decay=0.99, eps=1e-5, eps_in_sqrt=False)
 
 
-def falling(start: ArrayLike, final_fraction: ArrayLike, steps: ArrayLike) -> optax.Schedule:
-    """From `start` linearly to `final_fraction` of it over so many steps, constant then; all three may be traced."""
+def falling(start: ArrayLike, final_fraction: ArrayLike, steps: ArrayLike, after: float = 0.0) -> optax.Schedule:
+    """From `start` linearly to `final_fraction` of it over so many steps, of which the share `after` is constant; constant then.
+
+    The first three may be traced.
+    """
 
     def schedule(count: ArrayLike) -> Array:
-        done = jnp.minimum(jnp.divide(count, steps), 1.0)
+        done = jnp.clip((jnp.divide(count, steps) - after) / (1 - after), 0.0, 1.0)
         return start * (1 + (final_fraction - 1) * done)
 
     return schedule
@@ -180,5 +187,5 @@ def policy_gradient(policy: Policy, iterations: ArrayLike, **fit) -> Update:
 
 
 def natural_gradient(policy: Policy, iterations: ArrayLike, *, radius: ArrayLike, learning_rate_end: ArrayLike, **search) -> Update:
-    """TRPO: a natural gradient step on the surrogate within a trust region, whose radius falls over a run of `iterations`."""
-    return trust_region(policy, surrogate(policy), radius=falling(radius, learning_rate_end, iterations), **search)
+    """TRPO: a natural gradient step on the surrogate within a trust region, whose radius falls at the end of a run of `iterations`."""
+    return trust_region(policy, surrogate(policy), radius=falling(radius, learning_rate_end, iterations, STEADY), **search)

@@ -170,13 +170,13 @@ def test_sb3_contribs_radius_and_damping_are_ours_over_the_number_of_action_dime
     assert np.linalg.norm(ours - unscaled) > 0.1 * np.linalg.norm(theirs)
 
 
-def test_the_radius_falls_from_step_to_step_over_a_run():
+def test_the_radius_falls_from_step_to_step_in_the_last_fifth_of_a_run():
     params, batch = example()
-    rule = natural_gradient(POLICY, 4, radius=0.01, learning_rate_end=0.0, **SEARCH)
+    rule = natural_gradient(POLICY, 20, radius=0.01, learning_rate_end=0.0, **SEARCH)
     fit, moved = Fit(params, rule.init(params)), []
-    for _ in range(4):  # always from the same policy, that which acted
+    for _ in range(20):  # always from the same policy, that which acted
         fit, info = jax.jit(rule.step)(jax.random.key(0), fit._replace(params=params), batch)
         moved.append(float(info["kl"]))
-    assert int(fit.opt_state) == 4
-    # a step that is not halved has the divergence radius up to third order, so that the ratios are those of 4, 3, 2 and 1
-    assert_allclose(np.array(moved) / moved[0], [1, 3 / 4, 2 / 4, 1 / 4], rtol=0.05)
+    assert int(fit.opt_state) == 20
+    # a step that is not halved has the divergence radius up to third order, so that the ratios are those of the radii
+    assert_allclose(np.array(moved) / moved[0], [1] * 17 + [3 / 4, 2 / 4, 1 / 4], rtol=0.05)
