@@ -44,6 +44,11 @@ class Group:
         return np.array([row.worst for row in self.rows])
 
     @property
+    def averages(self) -> np.ndarray:
+        """[S] episode returns while training, averaged over the run."""
+        return np.array([row.average for row in self.rows])
+
+    @property
     def curve(self) -> tuple[np.ndarray, np.ndarray]:
         """Steps [P] that all seeds cover and the episode returns [S, P] there while training."""
         return statistics.common_curve([(row.curve_steps, row.curve_returns) for row in self.rows])

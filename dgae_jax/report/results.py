@@ -56,6 +56,12 @@ class Row:
     command: str
 
     @property
+    def average(self) -> float:
+        """Episode return while training, averaged over the curve from the first on; NaN where no episode has ended."""
+        known = self.curve_returns[np.isfinite(self.curve_returns)]
+        return float(known.mean()) if known.size else math.nan
+
+    @property
     def task(self) -> str:
         """The task with its version, where it has one, and whether there is noise on it."""
         noise = " with noise" if any((self.config.get("noise") or {}).values()) else ""

@@ -38,14 +38,18 @@ def _returns(group: Group) -> tuple[str, ...]:
 
 
 def attribution(groups: Iterable[Group]) -> Table:
-    """Final returns of variants, and the difference of their interquartile means from that of the first of the task."""
-    rows = [
-        (group.task, group.name, str(len(group.rows)), spread(group.finals), between(analysis.interquartile_mean(group.finals)),
-         NONE if group is members[0] else _difference(members[0], group))
-        for members in by_task(groups).values()
-        for group in members
-    ]  # fmt: skip
-    return Table(("task", "variant", "seeds", "mean ± std", "IQM [95 %]", "difference from the first [95 %]"), rows)
+    """Of variants the final returns, and the returns while training averaged over the run, which depend less on where it ends; both
+    as the difference of their interquartile means from that of the first of the task too.
+    """
+    rows = []
+    for members in by_task(groups).values():
+        for group in members:
+            cells = [group.task, group.name, str(len(group.rows))]
+            for scores, first in ((group.finals, members[0].finals), (group.averages, members[0].averages)):
+                cells += [spread(scores), NONE if group is members[0] else _apart(first, scores)]
+            rows.append(tuple(cells))
+    different = "difference from the first [95 %]"
+    return Table(("task", "variant", "seeds", "at the end, mean ± std", different, "over the run, mean ± std", different), rows)
 
 
 def risk(groups: Iterable[Group]) -> Table:
@@ -105,10 +109,12 @@ def comparison(first: Iterable[Group], second: Iterable[Group], names: tuple[str
 
 
 def _difference(first: Group | None, second: Group | None) -> str:
-    if first is None or second is None:
-        return NONE
-    apart = analysis.estimate(statistics.difference(statistics.interquartile_mean), [first.finals], [second.finals])
-    return between(apart, "{:+,.0f}")
+    return NONE if first is None or second is None else _apart(first.finals, second.finals)
+
+
+def _apart(first: np.ndarray, second: np.ndarray) -> str:
+    """The difference of the interquartile means of scores [S], the second's minus the first's."""
+    return between(analysis.estimate(statistics.difference(statistics.interquartile_mean), [first], [second]), "{:+,.0f}")
 
 
 def number(value: float, form: str = "{:,.0f}") -> str:

@@ -43,18 +43,22 @@ def test_two_studies_are_compared_where_both_have_results(grouped):
 
 def test_variants_are_named_and_compared_with_the_first_of_their_task_noise_making_another_task(grouped):
     noise = row("hopper", "dppo")["config"] | {"noise": {"reward": 0.5}}
-    scalar = plain([1, 3], algo="ppo", variant="scalar", cell="hopper-scalar")
+
+    def trained(scores, average, variant, **changes):
+        curve = {"steps": [1, 2, 3], "return": [None, average - 1, average + 1]}
+        return plain(scores, variant=variant, cell=f"hopper-{variant}", curve=curve, **changes)
+
     rows = [
-        *scalar,
-        *plain([10, 10], variant="bellman", cell="hopper-bellman", hash="another"),
-        *plain([5, 5], variant="kappa", cell="hopper-kappa"),
-        *plain([7], variant="kappa+noise", cell="hopper-kappa+noise", config=noise, hash="third"),
+        *trained([1, 3], 2, "scalar", algo="ppo"),
+        *trained([10, 10], 4, "bellman", hash="another"),
+        *trained([5, 5], 1, "kappa"),
+        *trained([7], 6, "kappa+noise", config=noise, hash="third"),
     ]
     assert tables.attribution(grouped(rows)).rows == [
-        ("hopper-v4", "PPO (scalar)", "2", "2 ± 1", "2 [1, 3]", "–"),
-        ("hopper-v4", "DPPO (bellman)", "2", "10 ± 0", "10 [10, 10]", "+8 [+7, +9]"),
-        ("hopper-v4", "DPPO (kappa)", "2", "5 ± 0", "5 [5, 5]", "+3 [+2, +4]"),
-        ("hopper-v4 with noise", "DPPO (kappa+noise)", "1", "7 ± –", "7 [–]", "–"),
+        ("hopper-v4", "PPO (scalar)", "2", "2 ± 1", "–", "2 ± 0", "–"),
+        ("hopper-v4", "DPPO (bellman)", "2", "10 ± 0", "+8 [+7, +9]", "4 ± 0", "+2 [+2, +2]"),
+        ("hopper-v4", "DPPO (kappa)", "2", "5 ± 0", "+3 [+2, +4]", "1 ± 0", "−1 [−1, −1]"),
+        ("hopper-v4 with noise", "DPPO (kappa+noise)", "1", "7 ± –", "–", "6 ± –", "–"),
     ]
 
 
