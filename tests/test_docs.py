@@ -3,6 +3,7 @@
 import json
 import re
 
+import numpy as np
 import pytest
 
 from benchmarks.table import table
@@ -57,12 +58,29 @@ def test_a_table_of_measurements_is_what_its_command_prints(path):
         assert block == table(json.loads((ROOT / file).read_text()))
 
 
-@pytest.mark.parametrize(("path", "names"), [("README.md", ["returns"]), ("docs/results.md", ["returns", "reach"])])
-def test_the_tables_of_results_are_what_the_report_says(path, names, tmp_path):
+@pytest.mark.parametrize(
+    ("path", "study", "names"),
+    [
+        ("README.md", "tuned", ["returns"]),
+        ("docs/results.md", "tuned", ["returns", "reach"]),
+        ("docs/attribution.md", "attribution", ["attribution"]),
+    ],
+)
+def test_the_tables_of_results_are_what_the_report_says(path, study, names, tmp_path):
     document = tmp_path / "document.md"
     document.write_bytes((ROOT / path).read_bytes())
-    assert markdown.replace(document, groups_of(results.read(ROOT / "results" / "tuned").rows)) == names
+    assert markdown.replace(document, groups_of(results.read(ROOT / "results" / study).rows)) == names
     assert document.read_bytes() == (ROOT / path).read_bytes()
+
+
+def test_the_rate_of_similar_means_is_the_mean_of_the_seeds_in_the_file_and_the_papers_at_the_threshold_that_is_named():
+    seeds = json.loads((ROOT / "results" / "attribution" / "calibration.json").read_text()).values()
+    shares = ("0.1", "0.03", "0.01", "0.003")
+    rates = [np.mean([one["similar_means"][share] for one in seeds]) for share in shares]
+    text = (ROOT / "docs" / "attribution.md").read_text()
+    assert f"| c | {' | '.join(shares)} |" in text
+    assert f"| steps | {' | '.join(f'{100 * rate:.2f} %' for rate in rates)} |" in text
+    assert round(float(np.interp(0.00093, rates[::-1], [float(share) for share in shares[::-1]])), 3) == 0.005
 
 
 def test_a_committed_policy_is_there_for_every_result_and_knows_its_configuration():
