@@ -157,7 +157,7 @@ def falling(start: ArrayLike, final_fraction: ArrayLike, steps: ArrayLike, after
 
     def schedule(count: ArrayLike) -> Array:
         done = jnp.clip((jnp.divide(count, steps) - after) / (1 - after), 0.0, 1.0)
-        return start * (1 + (final_fraction - 1) * done)
+        return jnp.multiply(start, 1 + (final_fraction - 1) * done)
 
     return schedule
 
