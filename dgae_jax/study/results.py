@@ -38,7 +38,7 @@ def of_study(study: Study) -> dict[str, list[dict[str, Any]]]:
 
 
 def rows_of(study: Study, cell: Cell) -> list[dict[str, Any]]:
-    """A row per seed of a cell that is done; its policy is written too, unless it is there."""
+    """A row per seed of a cell that is done; its policy is written too."""
     run_dir, config = study.run_dir(cell), cell.config
     _keep_policy(run_dir, config, study.policy(cell))
     final, manifest = (json.loads((run_dir / name).read_bytes()) for name in ("evaluation.json", "manifest.json"))
@@ -109,7 +109,8 @@ def _curve(rows: list[dict[str, Any]]) -> dict[str, list]:
 
 
 def _keep_policy(run_dir: Path, config: Config, path: Path) -> None:
-    if not path.is_file():
+    """Write it unless it is there already, from this run: a cell that is trained again has a new one."""
+    if not path.is_file() or path.stat().st_mtime < (run_dir / "evaluation.json").stat().st_mtime:
         from dgae_jax.run import restore
 
         restore.save_networks(path, config, restore.trained(run_dir, config, "newest"))

@@ -2,9 +2,11 @@
 
 import dataclasses
 import json
+import os
 
 import pytest
 
+from dgae_jax.run import restore
 from dgae_jax.study import results, view
 from dgae_jax.study.matrix import Cell, Study
 from tests.runs import small
@@ -35,6 +37,19 @@ def study(tmp_path):
     cell = Cell("hopper-ppo-0", small())
     (tmp_path / "runs" / cell.name).mkdir(parents=True)
     return Study(tmp_path, (cell,), {})
+
+
+def test_a_cell_that_is_trained_again_has_a_new_policy_and_one_that_was_not_keeps_its_file(study, monkeypatch):
+    monkeypatch.setattr(restore, "trained", lambda *_: None)
+    monkeypatch.setattr(restore, "save_networks", lambda path, *_: path.write_text("new"))
+    run_dir, policy = study.run_dir(study.cells[0]), study.path / "policy.msgpack"
+    (run_dir / "evaluation.json").write_text("{}")
+    for age, content in ((-1, "new"), (1, "old")):
+        policy.write_text("old")
+        evaluated = (run_dir / "evaluation.json").stat().st_mtime
+        os.utime(policy, (evaluated + age, evaluated + age))
+        results._keep_policy(run_dir, study.cells[0].config, policy)
+        assert policy.read_text() == content
 
 
 def test_how_far_a_cell_is_is_read_from_its_last_whole_row_however_long_the_file(study):
