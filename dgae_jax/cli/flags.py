@@ -27,7 +27,7 @@ GROUPS = {
     "policy": (),
     "critic": (),
     "run": ("run_dir", "resume", "resume_or_start", "inexact", "checkpoint_every", "keep_checkpoints", "log", "cache_dir"),
-    "evaluation": ("engine", "episodes"),
+    "evaluation": ("eval_engine", "episodes"),
     "device": ("devices", "coordinator", "num_processes", "process_id"),
     "diagnostics": ("diagnostics", "max_nonfinite", "debug_nonfinite"),
 }

@@ -10,10 +10,13 @@ def engines_of(config: Config) -> tuple[str, ...]:
     return ("gymnasium", *spec.engines) if spec.referees else spec.engines
 
 
-def engine_of(config: Config, engine: str | None) -> str:
-    """The engine of that name, the first of `engines_of` where there is none; raises ConfigError if the run cannot have it."""
+def engine_of(config: Config, engine: str | None, setting: str = "engine") -> str:
+    """The engine of that name, the first of `engines_of` where there is none; raises ConfigError if the run cannot have it.
+
+    `setting` is what the name was given as.
+    """
     if engine is not None and engine not in engines_of(config):
-        raise invalid("engine", engine, f"one of {', '.join(engines_of(config))} with {config.env}")
+        raise invalid(setting, engine, f"one of {', '.join(engines_of(config))} with {config.env}")
     return engine or engines_of(config)[0]
 
 

@@ -43,7 +43,7 @@ class RunOptions:
     """Let --resume continue with another --physics, device, number of cores or versions: the same in the statistical sense only."""
     max_nonfinite: int = 10
     """Failures in a row before the run is stopped: an update not finite and left out, or most world steps invalid [iterations]."""
-    engine: str | None = None
+    eval_engine: str | None = None
     """Where policies are evaluated: gymnasium, whose task has no noise, or an engine as in --physics, with the noise of the
     training; by default the first that the task has."""
     episodes: int = 20
@@ -71,7 +71,7 @@ WHOLE = {
 
 def validate_options(options: RunOptions, config: Config) -> None:
     """Raise `ConfigError` for the first option that is invalid, in a run of `config`."""
-    engine_of(config, options.engine)
+    engine_of(config, options.eval_engine, "eval_engine")
     for name, (low, high, reason) in WHOLE.items():
         value = getattr(options, name)
         if value is not None and not low <= value <= high:
@@ -109,7 +109,7 @@ def _validate_log(names: tuple[str, ...]) -> None:
             raise ConfigError(f'log {name}: {SINKS[name]} is missing; pip install "dgae_jax[{name}]"', "log")
 
 
-_KEPT = ("devices", "checkpoint_every", "keep_checkpoints", "max_nonfinite", "engine", "episodes", "debug_nonfinite", "log")
+_KEPT = ("devices", "checkpoint_every", "keep_checkpoints", "max_nonfinite", "eval_engine", "episodes", "debug_nonfinite", "log")
 """What a run goes on with when it is resumed."""
 
 
@@ -121,7 +121,7 @@ def to_dict(options: RunOptions) -> dict[str, Any]:
 def from_dict(data: Any) -> RunOptions:
     """What `to_dict` wrote; defaults for all else."""
     found = data if isinstance(data, dict) else {}
-    usual = to_dict(RunOptions(devices=1, engine=""))
+    usual = to_dict(RunOptions(devices=1, eval_engine=""))
     kept: dict[str, Any] = {name: found[name] for name in _KEPT if type(found.get(name)) is type(usual[name])}
     viewers: dict[str, Any] = {"log": [name for name in SINKS if name in kept.get("log", [])]}
     return RunOptions(**kept | viewers)

@@ -85,7 +85,7 @@ class Record:
 
     def evaluate(self, policies: Fitted, watch: Watch) -> dict[str, Any]:
         """Returns of the policies as they are now, noted and drawn."""
-        result = evaluate_policies(policies, self.config, engine=self.options.engine, episodes=self.options.episodes, watch=watch)
+        result = evaluate_policies(policies, self.config, engine=self.options.eval_engine, episodes=self.options.episodes, watch=watch)
         if not self.evaluated:
             self.evaluations.append(self.steps, result)
             self.feed.evaluations([{"steps": self.steps, **one} for one in result["seeds"]])

@@ -159,7 +159,7 @@ def _evaluate(config: Config, options: RunOptions, record: Record, signals: Sign
     """The evaluation at the end, which may take longer than a short training."""
     with signals.may_stop(), Reporter(page=record.page) as reporter:
         episodes = counted(options.episodes, "episode") + (f" of each of {config.num_seeds} seeds" if config.num_seeds > 1 else "")
-        reporter.announce(f"evaluating {episodes} in {referee(config)} ({engine_of(config, options.engine)})")
+        reporter.announce(f"evaluating {episodes} in {referee(config)} ({engine_of(config, options.eval_engine)})")
         return record.evaluate(hosts.whole(policies_of(state)), reporter.watch)
 
 

@@ -51,7 +51,7 @@ def train(tuning: Tuning, study: optuna.Study, trials: list[Trial], signals: Sig
         states = stacked([init(config, keys) for config in configs])  # one after the other: see parallel.in_turn
         compile_aside(step, settings, states)
     options = tuning.options  # no trial's network differs in shape, so that one program evaluates them all
-    evaluate = partial(evaluate_policies, config=configs[0], engine=options.engine, episodes=options.episodes)
+    evaluate = partial(evaluate_policies, config=configs[0], engine=options.eval_engine, episodes=options.episodes)
     every, results = quarter(configs[0]), [dict[str, Any]() for _ in trials]
     alive, total = set(range(len(trials))), configs[0].iterations
     for done in range(1, total + 1):

@@ -133,7 +133,7 @@ def _page(tuning: Tuning, study: optuna.Study, best: list[FrozenTrial], cards: s
     seeds = f"{tuning.seeds} seeds from {FIRST_SEED}" if tuning.seeds > 1 else f"seed {FIRST_SEED}"
     what = f"{config.task}, {config.algo} on {config.physics}: {len(trials)} trials of {config.total_steps:,} steps, {seeds}"
     searched = ", ".join(f"{path} {dimension}" for path, dimension in tuning.space.items())
-    where, episodes = engine_of(config, tuning.options.engine), counted(tuning.options.episodes, "episode")
+    where, episodes = engine_of(config, tuning.options.eval_engine), counted(tuning.options.episodes, "episode")
     measure = f"{TARGET} of {episodes} per seed in {where}, of the policy at the end"
     command = f"dgae train --config {tuning.directory / 'best.json'}"
     return (

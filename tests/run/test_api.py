@@ -50,7 +50,7 @@ def test_a_run_with_a_directory_is_that_of_the_command_line_and_goes_on_if_asked
 
 def test_a_run_is_evaluated_where_asked_to_and_in_an_engine_of_ours_with_the_noise_of_the_training():
     config = dataclasses.replace(small(), noise=NoiseConfig(reward=100.0))
-    noisy, calm = (train(config, quiet=True, engine=engine, **CHOSEN).evaluation for engine in ("native", "gymnasium"))
+    noisy, calm = (train(config, quiet=True, eval_engine=engine, **CHOSEN).evaluation for engine in ("native", "gymnasium"))
     assert (noisy["engine"], calm["engine"]) == ("native", "gymnasium")
     assert abs(noisy["return_mean"]) > 100 > calm["return_mean"] > 0  # of an episode of some ten steps, each with a reward of 1 or 2
 
@@ -60,7 +60,7 @@ def test_a_run_is_evaluated_where_asked_to_and_in_an_engine_of_ours_with_the_noi
     [
         (dataclasses.replace(small(), gamma=1.5), {}, "gamma 1.5: must be"),
         (small(), {"episodes": 0}, "episodes 0: must be"),
-        (small(), {"engine": "mujoco"}, "engine mujoco: must be one of gymnasium, "),
+        (small(), {"eval_engine": "mujoco"}, "eval_engine mujoco: must be one of gymnasium, "),
         (small(), {"episode": 3}, "episode: must be one of cache_dir, "),
         (small(), {"resume": "x"}, "resume: must be one of cache_dir, "),
     ],

@@ -113,8 +113,8 @@ def test_a_run_that_is_refused_for_its_metrics_is_left_as_it_was(run_dir):
 
 def test_a_resumed_run_goes_on_with_its_options(run_dir):
     assert manifest.options(run_dir) == RunOptions(checkpoint_every=256, episodes=1, devices=1)
-    manifest.add(run_dir, RunOptions(keep_checkpoints=7, engine="native", debug_nonfinite=True))
-    assert manifest.options(run_dir) == RunOptions(keep_checkpoints=7, engine="native", debug_nonfinite=True)
+    manifest.add(run_dir, RunOptions(keep_checkpoints=7, eval_engine="native", debug_nonfinite=True))
+    assert manifest.options(run_dir) == RunOptions(keep_checkpoints=7, eval_engine="native", debug_nonfinite=True)
 
 
 def test_resume_or_start_starts_a_run_and_then_goes_on_with_it(finished, tmp_path):
