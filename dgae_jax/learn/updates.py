@@ -22,8 +22,8 @@ PPO's clip and TRPO's radius act at ratios near 1, so nothing changes there; flo
 """
 
 STEADY = 0.8
-"""Share of a run after which the radius of a trust region falls, if it does: a smaller one from the start learns less, and what it is
-to prevent, that the last step is one too far, is a matter of the end (docs/decisions.md)."""
+"""Share of a run after which the radius of a trust region falls, if it does: one that falls from the start learns less on Walker2d, and
+what it is to prevent, that the last step is one too far, is a matter of the end (docs/decisions.md)."""
 
 
 def surrogate(policy: Policy, clip: ArrayLike = jnp.inf) -> Loss:
