@@ -93,10 +93,13 @@ def _version(name: str) -> str | None:
 
 @cache
 def _git_revision() -> str | None:
-    """The commit of the source tree, `+` appended where files differ from it; None outside a checkout."""
+    """The commit of the source tree, `+` appended where files differ from it; None outside a checkout.
+
+    A busy machine takes its time to say so, and None of a checkout would keep a run from going on.
+    """
 
     def git(*words: str) -> str:
-        done = subprocess.run(["git", *words], cwd=Path(__file__).parent, capture_output=True, text=True, check=True, timeout=5)
+        done = subprocess.run(["git", *words], cwd=Path(__file__).parent, capture_output=True, text=True, check=True, timeout=60)
         return done.stdout.strip()
 
     try:

@@ -87,6 +87,7 @@ class Record:
         """Returns of the policies as they are now, noted and drawn."""
         result = evaluate_policies(policies, self.config, engine=self.options.eval_engine, episodes=self.options.episodes, watch=watch)
         if not self.evaluated:
+            self.pending.result()  # no evaluation is on the disk without its checkpoint, from which the run goes on
             self.evaluations.append(self.steps, result)
             self.feed.evaluations([{"steps": self.steps, **one} for one in result["seeds"]])
         self.draw()

@@ -1,9 +1,12 @@
 """What a run leaves beside its checkpoints."""
 
+import time
+
 import jax
 import numpy as np
 
 from dgae_jax.configs.build import make_task
+from dgae_jax.run import checkpoint, record
 from dgae_jax.run.options import RunOptions
 from dgae_jax.run.record import Record
 from tests.runs import SMALL
@@ -25,3 +28,21 @@ def test_an_incident_can_be_replayed_from_its_file(state, tmp_path):
     replayed = env.set_state(env.reset(jax.random.key(0)), incident["qpos"][0], incident["qvel"][0])
     assert float(replayed.pipeline_state.qpos[2]) == 9
     np.testing.assert_array_equal(incident["action"], 0.5)
+
+
+def test_an_evaluation_is_noted_when_its_checkpoint_is_on_the_disk(state, tmp_path, monkeypatch):
+    seen, save = [], checkpoint.save
+
+    def slow(*args):
+        time.sleep(0.5)
+        seen.append((tmp_path / "evaluations.jsonl").read_bytes())
+        save(*args)
+
+    evaluation = {"seeds": [{"seed": 0, "return_mean": 1.0, "return_std": 0.0, "returns": [1.0]}]}
+    monkeypatch.setattr(checkpoint, "save", slow)
+    monkeypatch.setattr(record, "evaluate_policies", lambda *_, **__: evaluation)
+    with Record(tmp_path, SMALL, RunOptions(), 0) as kept:
+        kept.save(state)
+        kept.evaluate(None, print)
+    assert seen == [b""]
+    assert [row["return_mean"] for row in kept.evaluations.rows] == [1.0]

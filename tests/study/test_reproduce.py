@@ -101,7 +101,9 @@ def test_killed_in_the_middle_the_same_command_ends_with_the_same_results(whole,
         time.sleep(0.05)
     process.kill()
     studies.finish(process)
-    assert studies.finish(studies.start(study))[0] == 0
+    code, _, errors = studies.finish(studies.start(study))
+    said = [path.read_text() for path in sorted(study.glob("logs/*.log"))]
+    assert (code, errors) == (0, ""), said
     assert studies.rows(study) == studies.rows(whole[0])
 
 
