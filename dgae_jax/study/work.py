@@ -22,7 +22,7 @@ from dgae_jax.run.directory import InUseError
 from dgae_jax.run.options import RunOptions, from_dict, to_dict
 from dgae_jax.study.matrix import Cell, Study
 
-IN_USE_SECONDS = 60.0
+IN_USE_SECONDS = 300.0
 """How long to wait for another process of the same cell, which is about to stop."""
 
 
