@@ -102,7 +102,7 @@ class CriticConfig(FitConfig):
     kind: str | None = None
     """scalar (one value) or quantile (a distribution); unset: the algorithm's own."""
     target: str | None = None
-    """bellman, bellman-frozen, lambda-shift, sr-lambda or lambda-return; unset: the algorithm's own."""
+    """bellman, bellman-frozen, lambda-shift, sr-lambda, lambda-return or monte-carlo; unset: the algorithm's own."""
     quantiles: int | None = None
     """Quantiles K of a distributional critic [1]."""
     kappa: float | None = None

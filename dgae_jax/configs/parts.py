@@ -55,6 +55,7 @@ TARGETS = {
     "lambda-shift": Part("dgae_jax.learn.critics:LAMBDA_SHIFT"),
     "sr-lambda": Part("dgae_jax.learn.critics:SR_LAMBDA"),
     "lambda-return": Part("dgae_jax.learn.critics:LAMBDA_RETURN"),
+    "monte-carlo": Part("dgae_jax.learn.critics:MONTE_CARLO"),
 }
 """What a critic is fitted to: a `Target`."""
 

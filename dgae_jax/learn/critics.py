@@ -30,6 +30,8 @@ class Target(NamedTuple):
 
     Only for one-step targets: a shuffled minibatch has neither key nor trace, which are None then, as are the quantiles.
     """
+    lam: float | None = None
+    """λ of the trace where it is not that of the advantages."""
 
 
 def _bellman(key, reward, discount, trace, quantiles, next_quantiles):
@@ -52,6 +54,7 @@ BELLMAN = Target(_bellman, recompute=True)
 BELLMAN_FROZEN = Target(_bellman)
 LAMBDA_SHIFT = Target(_lambda_shift)
 SR_LAMBDA = Target(_sr_lambda)
+MONTE_CARLO = Target(_sr_lambda, lam=1.0)
 LAMBDA_RETURN = Target(_lambda_return)
 
 
@@ -67,7 +70,7 @@ def _critic(obs_size: int, outputs: int, hidden: Sequence[int], torso: Callable,
     def loss(params: Params, batch: Batch):
         return jnp.where(batch.valid, distance(network.apply(params, batch.obs), fitted_to(params, batch)), 0).mean(), {}
 
-    return Critic(network.init, network.apply, target.compute, loss)
+    return Critic(network.init, network.apply, target.compute, loss, target.lam)
 
 
 def scalar(obs_size: int, *, hidden: Sequence[int], target: Target, torso: Callable = Torso) -> Critic:

@@ -130,7 +130,8 @@ def _estimate(
     discount, trace = decay(step.terminated, step.truncated, gamma=gamma, lam=lam)
     residual = algorithm.residual(reward, discount, quantiles, next_quantiles)
     advantage = lambda_sum(residual, discount * trace)
-    target = algorithm.critic.target(key, reward, discount, trace, quantiles, next_quantiles)
+    reach = trace if algorithm.critic.lam is None else decay(step.terminated, step.truncated, gamma=gamma, lam=algorithm.critic.lam).trace
+    target = algorithm.critic.target(key, reward, discount, reach, quantiles, next_quantiles)
     mean, std = advantage.mean(where=step.valid), advantage.std(where=step.valid)
     standard = jnp.where(step.valid, (advantage - mean) / (std + 1e-8), 0)
     batch = Batch(obs, step.action, step.log_prob, standard, target, reward, discount, next_obs, step.valid)

@@ -94,6 +94,8 @@ class Critic(NamedTuple):
     """`target(key, reward, discount, trace, quantiles, next_quantiles) -> [T, N, J]`, of the critic that acted."""
     loss: Callable
     """`loss(params, batch) -> (scalar, info)`."""
+    lam: float | None = None
+    """λ of the target's trace where it is not that of the advantages."""
 
 
 class Update(NamedTuple):

@@ -34,6 +34,7 @@ def fixed_point(kind, target, lam, end="terminal"):
     options = {"quantiles": 4, "kappa": 1e-2} if kind == "quantile" else {}
     critic = CRITICS[kind].build(3, hidden=(), target=TARGETS[target].build, **options)
     obs, reward, terminated, next_obs = episodes(end)
+    lam = lam if critic.lam is None else critic.lam
     discount, trace = decay(terminated, jnp.zeros_like(terminated).at[-1].set(True), gamma=0.5, lam=lam)
     steps = 1500
     optimizer = optax.adam(optax.cosine_decay_schedule(0.05, steps))
@@ -58,7 +59,15 @@ def fixed_point(kind, target, lam, end="terminal"):
 @pytest.mark.parametrize("end", ["terminal", "absorbing"])
 @pytest.mark.parametrize(
     ("target", "lam"),
-    [("bellman", 0.5), ("bellman-frozen", 0.5), ("sr-lambda", 0.5), ("sr-lambda", 1.0), ("lambda-shift", 0.0), ("lambda-return", 1.0)],
+    [
+        ("bellman", 0.5),
+        ("bellman-frozen", 0.5),
+        ("sr-lambda", 0.5),
+        ("sr-lambda", 1.0),
+        ("lambda-shift", 0.0),
+        ("lambda-return", 1.0),
+        ("monte-carlo", 0.0),
+    ],
 )
 def test_the_critic_learns_the_true_quantiles(target, lam, end):
     got = fixed_point("quantile", target, lam, end)

@@ -118,13 +118,33 @@ def test_the_policy_finds_the_best_action_for_each_observation(algo):
 
 @pytest.mark.parametrize(
     ("algo", "target"),
-    [("ppo", "lambda-return"), ("dppo", "lambda-return"), ("dppo", "sr-lambda"), ("dppo", "lambda-shift"), ("dppo", "bellman")],
+    [
+        ("ppo", "lambda-return"),
+        ("dppo", "lambda-return"),
+        ("dppo", "sr-lambda"),
+        ("dppo", "lambda-shift"),
+        ("dppo", "bellman"),
+        ("dppo", "monte-carlo"),
+    ],
 )
 def test_the_critic_finds_the_value_of_a_constant_reward(algo, target):
     # V = 1 / (1 - ½) = 2, also across time limits, which do not end the bootstrap
     off = {"normalize_rewards": False, "normalize_observations": False}
     _, _, rows = learn(Constant(), algo, 60, gamma=0.5, episode_length=5, critic={"target": target}, **off)
     assert_allclose(rows["critic/value"][-1, 0], 2.0, atol=0.05)
+
+
+def test_monte_carlo_is_sr_lambda_with_a_lambda_of_1_for_the_critic_alone():
+    def first(target, lam):
+        _, state, _ = learn(Delayed(), "dppo", 1, lam=lam, critic={"target": target})
+        return jax.tree.map(np.asarray, (state.critic.params, state.policy.params))
+
+    critic, policy = first("monte-carlo", 0.5)
+    same, _ = first("sr-lambda", 1.0)
+    another, same_policy = first("sr-lambda", 0.5)
+    jax.tree.map(np.testing.assert_array_equal, critic, same)
+    jax.tree.map(np.testing.assert_array_equal, policy, same_policy)
+    assert not all(np.array_equal(x, y) for x, y in zip(jax.tree.leaves(critic), jax.tree.leaves(another), strict=True))
 
 
 @pytest.mark.parametrize("algo", ["ppo", "da2c"])
