@@ -49,7 +49,8 @@ class Arguments:
     algos: tuple[str, ...] = tuple(TABLE)
     """Algorithms."""
     variants: str | None = None
-    """Instead of the algorithms, all variants of one question: attribution, attribution-noise or risk."""
+    """Instead of the algorithms, all variants of one question: attribution, attribution-noise,
+    calibration or risk."""
     seeds: tuple[int, ...] = (0, 1, 2, 3, 4)
     """Seeds [1]."""
     scale: float = 1.0

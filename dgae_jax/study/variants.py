@@ -23,6 +23,14 @@ DISTRIBUTIONAL = {
 """A distribution. The loss of 64 quantiles is a sum with weights of ½ on average, 32 times the scalar one; Adam does not see the
 scale of a loss, but the bound of the gradient's norm, 0.5, does: 32 · 0.5 = 16 bounds both alike."""
 
+_MONTE_CARLO = "dppo --critic.target monte-carlo --critic.kappa 0.01 --critic.epochs 3"
+
+CALIBRATED = {
+    "monte-carlo-64": f"{_MONTE_CARLO} --num-envs 32 --horizon 64",
+    "monte-carlo-128": f"{_MONTE_CARLO} --num-envs 16 --horizon 128",
+}
+"""A critic that is told how the return went on, by rollouts of 64 and 128 steps."""
+
 NOISE = "--noise.reward 0.5 --noise.action 0.1"
 """Of rewards around 3 and actions within ±1."""
 
@@ -42,6 +50,8 @@ def _preferences() -> dict[str, str]:
 VARIANTS: dict[str, dict[str, str]] = {
     "attribution": {**SCALAR, **DISTRIBUTIONAL},
     "attribution-noise": _noisy({**SCALAR, **DISTRIBUTIONAL}),
+    "calibration": CALIBRATED,
     "risk": _preferences(),
 }
-"""What the gain of distributional critics is made of, with and without noise on the task; what a preference for safe returns buys."""
+"""What the gain of distributional critics is made of, with and without noise on the task; what makes their distributions hold; what a
+preference for safe returns buys."""

@@ -119,7 +119,7 @@ def test_every_variant_of_a_question_is_a_configuration_of_its_own():
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        ("--variants luck", "variants luck: must be one of attribution, attribution-noise, risk"),
+        ("--variants luck", "variants luck: must be one of attribution, attribution-noise, calibration, risk"),
         ("--variants risk --algos ppo", "algos ppo: must be left out with --variants"),
         ("--variants risk --config best.json", "config best.json: must be left out with --variants"),
     ],
