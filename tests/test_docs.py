@@ -64,6 +64,7 @@ def test_a_table_of_measurements_is_what_its_command_prints(path):
         ("README.md", "tuned", ["returns"]),
         ("docs/results.md", "tuned", ["returns", "reach"]),
         ("docs/attribution.md", "attribution", ["attribution"]),
+        ("docs/risk.md", "risk", ["risk"]),
     ],
 )
 def test_the_tables_of_results_are_what_the_report_says(path, study, names, tmp_path):
