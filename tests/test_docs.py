@@ -84,6 +84,13 @@ def test_the_rate_of_similar_means_is_the_mean_of_the_seeds_in_the_file_and_the_
     assert round(float(np.interp(0.00093, rates[::-1], [float(share) for share in shares[::-1]])), 3) == 0.005
 
 
+def test_the_coverage_of_critics_with_monte_carlo_targets_is_what_the_files_say():
+    study, text = ROOT / "results" / "calibration", (ROOT / "docs" / "decisions.md").read_text()
+    returns = {row.cell: row.final for row in results.read(study).rows}
+    for run, statistics in json.loads((study / "calibration.json").read_text()).items():
+        assert f"| `{run}` | {returns[run]:,.0f} | {100 * statistics['coverage_90']:.0f} % |" in text
+
+
 def test_a_committed_policy_is_there_for_every_result_and_knows_its_configuration():
     for row in results.read(ROOT / "results" / "tuned").rows:
         config = to_dict(restore.config_of(ROOT / "results" / "tuned" / "policies" / f"{row.cell}.msgpack"))
