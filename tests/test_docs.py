@@ -70,7 +70,7 @@ def test_a_table_of_measurements_is_what_its_command_prints(path):
 def test_the_tables_of_results_are_what_the_report_says(path, study, names, tmp_path):
     document = tmp_path / "document.md"
     document.write_bytes((ROOT / path).read_bytes())
-    assert markdown.replace(document, groups_of(results.read(ROOT / "results" / study).rows)) == names
+    assert markdown.replace(document, groups_of(results.read(ROOT / "results" / study).rows), study) == names
     assert document.read_bytes() == (ROOT / path).read_bytes()
 
 

@@ -37,7 +37,7 @@ class Arguments:
     """Film a typical run of each task for the page: of the best algorithm, the seed in the middle; they stay in STUDY/videos."""
     markdown: Path | None = None
     """A Markdown file in which the tables between `<!-- dgae report: NAME -->` and `<!-- /dgae report -->` are replaced; NAME is
-    returns, attribution, risk, reach or speed [path]."""
+    returns, attribution, risk, reach or speed, and NAME of STUDY a table that only a report on that study replaces [path]."""
 
 
 def main() -> int:
@@ -68,14 +68,14 @@ def _report(arguments: Arguments) -> int:
     from dgae_jax.report import groups, markdown, write
 
     if arguments.markdown:
-        markdown.blocks(arguments.markdown)
+        markdown.blocks(arguments.markdown, studies[0].name)
     if arguments.videos:
         for path in (path for study in studies for path in films.make(study)):
             terminal.say(f"written {path}")
     for path in write.write(studies, out, known):
         terminal.say(f"written {path}")
     if arguments.markdown:
-        names = markdown.replace(arguments.markdown, groups.groups_of(studies[0].rows))
+        names = markdown.replace(arguments.markdown, groups.groups_of(studies[0].rows), studies[0].name)
         terminal.say(f"written {arguments.markdown}: {', '.join(names)}")
     return 0
 

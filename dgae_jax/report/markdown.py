@@ -1,11 +1,13 @@
 """Tables inside documents: what stands between two markers is replaced by the table of that name.
 
-The markers are `<!-- dgae report: NAME -->` and `<!-- /dgae report -->`, on lines of their own.
+The markers are `<!-- dgae report: NAME -->` and `<!-- /dgae report -->`, on lines of their own. With `NAME of STUDY` a table is replaced
+by a report on the study in a directory of that name only, so that a document may have tables of several.
 """
 
 import re
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import NamedTuple
 
 from dgae_jax.configs.config import ConfigError, invalid
 from dgae_jax.report import tables
@@ -16,11 +18,31 @@ TABLES: dict[str, Callable[[Sequence[Group]], tables.Table]] = {
     "returns": tables.returns, "attribution": tables.attribution, "risk": tables.risk, "reach": tables.reach, "speed": tables.speed
 }  # fmt: skip
 
-_MARKER = re.compile(r"^<!-- (?:dgae report: (?P<name>.*?)|(?P<end>/dgae report)) -->$", re.MULTILINE)
+_MARKER = re.compile(r"^<!-- (?:dgae report: (?P<name>.*?)(?: of (?P<study>.*?))?|(?P<end>/dgae report)) -->$", re.MULTILINE)
 
 
-def blocks(path: Path) -> list[tuple[str, int, int]]:
-    """Name, start and end of what stands between each pair of markers; raises ConfigError where they are missing or do not match."""
+class Block(NamedTuple):
+    """What stands between a pair of markers."""
+
+    name: str
+    study: str | None
+    start: int
+    end: int
+
+
+def blocks(path: Path, study: str) -> list[Block]:
+    """The tables that a report on `study`, the name of its directory, replaces.
+
+    Raises ConfigError where there are none, or where the markers are missing or do not match.
+    """
+    found = _blocks(path)
+    if all(block.study not in (None, study) for block in found):
+        studies = ", ".join(dict.fromkeys(str(block.study) for block in found))
+        raise invalid("markdown", path, f"a file with a table of {study}; its tables are of {studies}")
+    return [block for block in found if block.study in (None, study)]
+
+
+def _blocks(path: Path) -> list[Block]:
     markers = list(_MARKER.finditer(_text(path)))
     if not markers:
         raise invalid("markdown", path, "a file with <!-- dgae report: NAME --> and <!-- /dgae report --> on lines of their own")
@@ -33,19 +55,19 @@ def blocks(path: Path) -> list[tuple[str, int, int]]:
             raise invalid("markdown", path, f"a file with tables named {', '.join(TABLES)}, not {name}")
         if end is None or end["end"] is None:
             raise invalid("markdown", path, f"a file with <!-- /dgae report --> after the table {name}")
-    return [(opening["name"], opening.end() + 1, end.start()) for opening, end in zip(openings, ends, strict=True)]
+    return [Block(opening["name"], opening["study"], opening.end() + 1, end.start()) for opening, end in zip(openings, ends, strict=True)]
 
 
-def replace(path: Path, groups: Sequence[Group]) -> list[str]:
-    """Replace every block of the file by its table; their names."""
-    text, found = _text(path), blocks(path)
-    for name, start, end in reversed(found):
-        text = text[:start] + tables.markdown(TABLES[name](groups)) + "\n" + text[end:]
+def replace(path: Path, groups: Sequence[Group], study: str) -> list[str]:
+    """Replace every block of the file that is of the study by its table; their names."""
+    text, found = _text(path), blocks(path, study)
+    for block in reversed(found):
+        text = text[: block.start] + tables.markdown(TABLES[block.name](groups)) + "\n" + text[block.end :]
     try:
         files.replace(path, text.encode())
     except OSError as reason:
         raise invalid("markdown", path, f"a file that can be written ({reason.strerror})") from reason
-    return [name for name, _, _ in found]
+    return [block.name for block in found]
 
 
 def _text(path: Path) -> str:

@@ -87,13 +87,23 @@ end
 def test_every_block_of_a_document_is_replaced_and_the_rest_stays(grouped, tmp_path):
     path, groups = tmp_path / "doc.md", grouped(plain([1, 3]))
     path.write_text(DOCUMENT)
-    assert markdown.replace(path, groups) == ["returns", "speed"]
+    assert markdown.replace(path, groups, "study") == ["returns", "speed"]
     new = path.read_text()
     assert new == DOCUMENT.replace("old\n", tables.markdown(tables.returns(groups)) + "\n").replace(
         "speed -->\n", "speed -->\n" + tables.markdown(tables.speed(groups)) + "\n"
     )
-    markdown.replace(path, groups)
+    markdown.replace(path, groups, "study")
     assert path.read_text() == new
+
+
+def test_a_table_of_a_study_is_replaced_by_a_report_on_that_study_only(grouped, tmp_path):
+    path, groups = tmp_path / "doc.md", grouped(plain([1, 3]))
+    text = "<!-- dgae report: returns of short -->\n<!-- /dgae report -->\n<!-- dgae report: speed of long -->\n<!-- /dgae report -->\n"
+    path.write_text(text)
+    assert markdown.replace(path, groups, "long") == ["speed"]
+    assert path.read_text() == text.replace("of long -->\n", "of long -->\n" + tables.markdown(tables.speed(groups)) + "\n")
+    with pytest.raises(ConfigError, match="must be a file with a table of other; its tables are of short, long"):
+        markdown.replace(path, groups, "other")
 
 
 @pytest.mark.parametrize(
@@ -111,7 +121,7 @@ def test_markers_that_do_not_match_are_refused(text, sentence, tmp_path):
     path = tmp_path / "doc.md"
     path.write_text(text)
     with pytest.raises(ConfigError) as caught:
-        markdown.blocks(path)
+        markdown.blocks(path, "study")
     assert str(caught.value) == f"markdown {path}: must be {sentence}"
 
 
@@ -119,4 +129,4 @@ def test_a_document_that_cannot_be_read_is_refused(tmp_path):
     (tmp_path / "bytes").write_bytes(b"\xff")
     for name, reason in (("none", "No such file or directory"), ("bytes", "not text in UTF-8"), (".", "Is a directory")):
         with pytest.raises(ConfigError, match=reason):
-            markdown.blocks(tmp_path / name)
+            markdown.blocks(tmp_path / name, "study")
