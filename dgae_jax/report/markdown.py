@@ -15,8 +15,13 @@ from dgae_jax.report.groups import Group
 from dgae_jax.run import files
 
 TABLES: dict[str, Callable[[Sequence[Group]], tables.Table]] = {
-    "returns": tables.returns, "attribution": tables.attribution, "risk": tables.risk, "reach": tables.reach, "speed": tables.speed
-}  # fmt: skip
+    "returns": tables.returns,
+    "attribution": tables.attribution,
+    "attribution-over-tasks": tables.attribution_over_tasks,
+    "risk": tables.risk,
+    "reach": tables.reach,
+    "speed": tables.speed,
+}
 
 _MARKER = re.compile(r"^<!-- (?:dgae report: (?P<name>.*?)(?: of (?P<study>.*?))?|(?P<end>/dgae report)) -->$", re.MULTILINE)
 

@@ -52,6 +52,24 @@ def attribution(groups: Iterable[Group]) -> Table:
     return Table(("task", "variant", "seeds", "at the end, mean ± std", different, "over the run, mean ± std", different), rows)
 
 
+def attribution_over_tasks(groups: Iterable[Group]) -> Table:
+    """Of variants the probability that a seed is above one of the first variant of its task, at the end and over the run, the mean over
+    the tasks.
+    """
+    duels: dict[str, list[tuple[Group, Group]]] = {}
+    for first, *others in by_task(groups).values():
+        for group in others:
+            duels.setdefault(group.name, []).append((group, first))
+    rows = []
+    for name, pairs in duels.items():
+        cells = [name, str(len(pairs)), str(sum(len(group.rows) for group, _ in pairs))]
+        for scores in (lambda group: group.finals, lambda group: group.averages):
+            better, worse = zip(*((scores(group), scores(first)) for group, first in pairs), strict=True)
+            cells.append(between(analysis.estimate(statistics.improvement, better, worse), "{:.2f}"))
+        rows.append(tuple(cells))
+    return Table(("variant", "tasks", "seeds", "above the first at the end [95 %]", "above the first over the run [95 %]"), rows, keys=1)
+
+
 def risk(groups: Iterable[Group]) -> Table:
     """Final returns: the mean over episodes, and the mean of their worst quarter (CVaR)."""
     rows = []
