@@ -62,7 +62,7 @@ def test_a_table_of_measurements_is_what_its_command_prints(path):
     ("path", "study", "names"),
     [
         ("README.md", "tuned", ["returns"]),
-        ("docs/results.md", "tuned", ["returns", "reach"]),
+        ("docs/results.md", "tuned", ["returns", "improvement", "reach"]),
         ("docs/attribution.md", "attribution", ["attribution", "attribution-over-tasks"]),
         ("docs/risk.md", "risk", ["risk"]),
     ],

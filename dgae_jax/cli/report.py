@@ -37,8 +37,8 @@ class Arguments:
     """Film a typical run of each task for the page: of the best algorithm, the seed in the middle; they stay in STUDY/videos."""
     markdown: Path | None = None
     """A Markdown file in which the tables between `<!-- dgae report: NAME -->` and `<!-- /dgae report -->` are replaced; NAME is
-    returns, attribution, attribution-over-tasks, risk, reach or speed, and NAME of STUDY a table that only a report on that study
-    replaces [path]."""
+    returns, improvement, attribution, attribution-over-tasks, risk, reach or speed, and NAME of STUDY a table that only a report on
+    that study replaces [path]."""
 
 
 def main() -> int:

@@ -10,12 +10,13 @@ from pathlib import Path
 from typing import NamedTuple
 
 from dgae_jax.configs.config import ConfigError, invalid
-from dgae_jax.report import tables
+from dgae_jax.report import analysis, tables
 from dgae_jax.report.groups import Group
 from dgae_jax.run import files
 
 TABLES: dict[str, Callable[[Sequence[Group]], tables.Table]] = {
     "returns": tables.returns,
+    "improvement": lambda groups: tables.improvement(analysis.improvements(groups)),
     "attribution": tables.attribution,
     "attribution-over-tasks": tables.attribution_over_tasks,
     "risk": tables.risk,
