@@ -7,7 +7,7 @@ from concurrent.futures import Future
 from typing import Any
 
 Watch = Callable[[str], None]
-"""Told, now and then, what is going on."""
+"""Told, now and then, what is going on; what it raises breaks it off."""
 
 LOOK_EVERY = 0.5
 """Seconds between looks at the compiler."""
@@ -22,7 +22,7 @@ def unwatched(_: str) -> None:
 def compile_aside(program: Any, *args: Any, watch: Watch = unwatched, what: str = "compiling") -> None:
     """Compile a jitted function for such arguments, so that calling it does not; in a thread, while this one waits.
 
-    Python runs no signal handler as long as its main thread is inside of XLA. An exception that a handler raises leaves the
+    Python runs no signal handler as long as its main thread is inside of XLA. An exception that `watch` raises leaves the
     compiler to itself: it cannot be broken off, and holds up the end of the process unless that is `os._exit`.
     """
     since, done = time.monotonic(), Future()

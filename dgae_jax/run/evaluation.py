@@ -79,7 +79,7 @@ def evaluate_policies(
     """Undiscounted returns of the policies of a run, one per trained seed: `returns` are all of them, `seeds` each one's.
 
     Every policy plays the same `episodes` initial states, which `seed` determines. `engine` is the first of `engines_of` unless
-    another is named; raises ConfigError if it is none of them. May be broken off: it comes back to Python every `CHUNK` steps.
+    another is named; raises ConfigError if it is none of them. May be broken off by `watch`, which is told at least every `CHUNK` steps.
     """
     engine = engine_of(config, engine)
     run = _in_gymnasium if engine == "gymnasium" else _in_jax

@@ -8,6 +8,7 @@ from collections.abc import Iterator
 from typing import Any
 
 from dgae_jax.run import hosts
+from dgae_jax.run.compiling import Watch, unwatched
 
 KINDS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 """Ctrl-C, a scheduler, and a terminal that was closed."""
@@ -41,15 +42,21 @@ class Signals:
             signal.signal(kind, handler)
 
     @contextlib.contextmanager
-    def may_stop(self) -> Iterator[None]:
-        """Around work that may be broken off: raises `Stopped` when a signal arrives, or has arrived.
+    def may_stop(self, watch: Watch = unwatched) -> Iterator[Watch]:
+        """Around work that may be broken off: raises `Stopped` if a signal has arrived, as does the watch that it gives, later.
 
-        Of several processes none can be broken off alone: there only what all have agreed on counts.
+        The handler itself raises nothing: it may interrupt an import or a destructor of anybody's, which would lose the exception or
+        keep a lock. Of several processes none can be broken off alone: there only what all have agreed on counts.
         """
+
+        def heeding(text: str) -> None:
+            self._stop()
+            watch(text)
+
         self.nothing_to_lose = hosts.alone() or self.agreed
         try:
             self._stop()
-            yield
+            yield heeding
         finally:
             self.nothing_to_lose = False
 
@@ -78,6 +85,7 @@ class Signals:
         self.received = signal.Signals(kind)
         for each in self.before:
             signal.signal(each, signal.SIG_IGN if each == signal.SIGHUP else signal.SIG_DFL)
-        self._stop()
+        if self.nothing_to_lose:
+            return
         with contextlib.suppress(OSError):  # no print: it may be what was interrupted
             os.write(2, f"{self.name}: finishing what is running, then saving; a second signal ends it at once\n".encode())

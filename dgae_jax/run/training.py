@@ -129,11 +129,11 @@ def _iterate(config: Config, options: RunOptions, record: Record, signals: Signa
 def _compiled(config: Config, trainer: Trainer, state: TrainState | None, signals: Signals, reporter: Reporter) -> TrainState:
     """The state to begin with, when the programs are compiled. Nothing is lost by ending meanwhile."""
     reporter.announce("compiling")
-    with signals.may_stop():
+    with signals.may_stop(reporter.watch) as watch:
         if state is None:
-            compile_aside(trainer.init, config, seed_keys(config), watch=reporter.watch)
+            compile_aside(trainer.init, config, seed_keys(config), watch=watch)
             state = trainer.init(config, seed_keys(config))
-        compile_aside(trainer.dispatch, config, state, 1, watch=reporter.watch)
+        compile_aside(trainer.dispatch, config, state, 1, watch=watch)
     return state
 
 
@@ -151,16 +151,16 @@ def _dispatch(config: Config, trainer: Trainer, state: TrainState, count: int, r
 def _look(record: Record, state: TrainState, signals: Signals, reporter: Reporter, heed: Heed) -> None:
     """Evaluate on the way, unless a signal came: a run that goes on later makes up for it."""
     if not record.evaluated:
-        with contextlib.suppress(Stopped), signals.may_stop():
-            heed(record.steps, record.evaluate(hosts.whole(policies_of(state)), reporter.watch))
+        with contextlib.suppress(Stopped), signals.may_stop(reporter.watch) as watch:
+            heed(record.steps, record.evaluate(hosts.whole(policies_of(state)), watch))
 
 
 def _evaluate(config: Config, options: RunOptions, record: Record, signals: Signals, state: TrainState) -> dict[str, Any]:
     """The evaluation at the end, which may take longer than a short training."""
-    with signals.may_stop(), Reporter(page=record.page) as reporter:
+    with Reporter(page=record.page) as reporter, signals.may_stop(reporter.watch) as watch:
         episodes = counted(options.episodes, "episode") + (f" of each of {config.num_seeds} seeds" if config.num_seeds > 1 else "")
         reporter.announce(f"evaluating {episodes} in {referee(config)} ({engine_of(config, options.eval_engine)})")
-        return record.evaluate(hosts.whole(policies_of(state)), reporter.watch)
+        return record.evaluate(hosts.whole(policies_of(state)), watch)
 
 
 def _failures(before: np.ndarray, measured: dict[str, Any], count: int, samples: int) -> np.ndarray:

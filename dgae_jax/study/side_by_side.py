@@ -46,10 +46,10 @@ def train(tuning: Tuning, study: optuna.Study, trials: list[Trial], signals: Sig
     machine.use_cache(tuning.options.cache_dir)
     env, keys, settings = make_task(configs[0]), seed_keys(configs[0]), stacked(configs)
     init, step = make_trainer(env, 1).init, make_step(env)
-    with signals.may_stop():
-        compile_aside(init, configs[0], keys)
+    with signals.may_stop() as watch:
+        compile_aside(init, configs[0], keys, watch=watch)
         states = stacked([init(config, keys) for config in configs])  # one after the other: see parallel.in_turn
-        compile_aside(step, settings, states)
+        compile_aside(step, settings, states, watch=watch)
     options = tuning.options  # no trial's network differs in shape, so that one program evaluates them all
     evaluate = partial(evaluate_policies, config=configs[0], engine=options.eval_engine, episodes=options.episodes)
     every, results = quarter(configs[0]), [dict[str, Any]() for _ in trials]
@@ -63,8 +63,8 @@ def train(tuning: Tuning, study: optuna.Study, trials: list[Trial], signals: Sig
             break
         if done % every == 0 or done == total:
             for i in sorted(alive):
-                with signals.may_stop():
-                    results[i] = evaluate(jax.tree.map(lambda x, i=i: x[i], policies_of(states)))
+                with signals.may_stop() as watch:
+                    results[i] = evaluate(jax.tree.map(lambda x, i=i: x[i], policies_of(states)), watch=watch)
         if done % every == 0 and done < total:
             alive -= {i for i in alive if _is_hopeless(trials[i], results[i], done // every)}
     return [_finish(tuning, study, trials[i], configs[i], results[i]) if i in alive else None for i in range(len(trials))]
