@@ -74,7 +74,13 @@ def test_an_invalid_setting_is_refused_before_anything_is_written(config, option
 
 def test_a_signal_is_an_exception_that_names_the_directory_to_go_on_in(tmp_path, monkeypatch):
     monkeypatch.setattr(api.tempfile, "tempdir", str(tmp_path))
-    monkeypatch.setattr(record_module, "evaluate_policies", lambda *_, **__: signal.raise_signal(signal.SIGTERM))
+    honest = record_module.evaluate_policies
+
+    def interrupted(*args, **how):
+        signal.raise_signal(signal.SIGTERM)
+        return honest(*args, **how)
+
+    monkeypatch.setattr(record_module, "evaluate_policies", interrupted)
     with pytest.raises(RunError, match="stopped by SIGTERM; continue with --resume ") as caught:
         train(small(), quiet=True, **CHOSEN)
     assert caught.value.exit_code == 143
