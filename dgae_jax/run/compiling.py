@@ -27,7 +27,7 @@ def compile_aside(program: Any, *args: Any, watch: Watch = unwatched, what: str 
     """
     since, done = time.monotonic(), Future()
     watch(what)
-    lowered = program.lower(*args)  # Python: signals are handled meanwhile, and settings of this thread hold
+    lowered = program.lower(*args)  # here, where settings of this thread hold
 
     def work():
         try:

@@ -37,6 +37,8 @@ def test_a_signal_in_an_evaluation_breaks_it_off_and_the_run_goes_on_later_to_th
         calls.append(how)
         if len(calls) == evaluation:
             signal.raise_signal(kind)
+            honest(*args, **how)
+            pytest.fail("the evaluation went on")
         return honest(*args, **how)
 
     honest = record_module.evaluate_policies
