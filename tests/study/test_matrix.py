@@ -128,3 +128,9 @@ def test_variants_have_algorithms_of_their_own(words, message):
     arguments, rest = parse_known(reproduce.Arguments, "", ["study", *words.split()], rest=reproduce.REST)
     with pytest.raises(ConfigError, match=message):
         reproduce._cells(arguments, rest)
+
+
+def test_with_noise_the_variants_have_the_names_that_a_report_gives_them_and_its_mark():
+    assert [name.removesuffix("+noise") for name in VARIANTS["attribution-noise"]] == list(VARIANTS["attribution"])
+    for variants in VARIANTS.values():
+        assert all(name.endswith("+noise") == ("--noise." in words) for name, words in variants.items())
