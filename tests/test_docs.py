@@ -63,6 +63,8 @@ def test_a_table_of_measurements_is_what_its_command_prints(path):
     [
         ("README.md", "tuned", ["returns"]),
         ("docs/results.md", "tuned", ["returns", "improvement", "reach"]),
+        ("docs/results.md", "long", ["returns", "improvement"]),
+        ("docs/results.md", "swimmer-099", ["returns"]),
         ("docs/reproduction.md", "paper", ["returns", "improvement"]),
         ("docs/attribution.md", "attribution", ["attribution", "attribution-over-tasks"]),
         ("docs/risk.md", "risk", ["risk"]),
