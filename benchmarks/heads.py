@@ -1,0 +1,126 @@
+"""Critics whose quantiles cannot cross, another loss and another λ: what the policy returns, and how many returns the quantiles hold.
+
+    python benchmarks/heads.py --json benchmarks/results/heads.json
+
+Each is a part of DPPO that this file puts in the package's tables. Rows that the file has are not trained again.
+"""
+
+import dataclasses
+import itertools
+import json
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Literal, get_args
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+import dgae_jax as dg
+from dgae_jax.cli.arguments import parse
+from dgae_jax.configs.config import resolve
+from dgae_jax.configs.parts import CRITICS, TARGETS, Part
+from dgae_jax.learn.critics import SR_LAMBDA, quantile
+from dgae_jax.learn.types import Batch, Critic, Params
+from dgae_jax.maths.transport import quantile_huber_loss
+from dgae_jax.run import machine
+from dgae_jax.run.calibration import calibrate
+
+Quantiles = Float[Array, "*batch K"]
+Name = Literal["plain", "clipped", "sorted", "softplus", "energy", "lambda-0.99"]
+
+
+@dataclass(frozen=True)
+class Arguments:
+    """What to train."""
+
+    critics: tuple[Name, ...] = get_args(Name)
+    """Critics, all with kappa 0.01 and 3 epochs."""
+    tasks: tuple[str, ...] = ("hopper",)
+    """Tasks."""
+    seeds: tuple[int, ...] = (1001, 1002)
+    """Seeds, none of which is in the table of results."""
+    total_steps: int = 1_000_000
+    """Samples of a run [samples]."""
+    json: Path | None = None
+    """File to keep the numbers in [path]."""
+
+
+def softplus_steps(x: Quantiles) -> Quantiles:
+    """The first output is the mean, the others are the steps from a quantile to the next, at first about 0.007."""
+    steps = jnp.cumsum(jax.nn.softplus(x[..., 1:] - 5), -1)
+    steps = jnp.concatenate([jnp.zeros_like(x[..., :1]), steps], -1)
+    return x[..., :1] + steps - steps.mean(-1, keepdims=True)
+
+
+def energy_distance(quantiles: Quantiles, target: Quantiles) -> Float[Array, "*batch"]:
+    """E|X − Y| − ½ E|X − X′|, half the energy distance up to a constant of the target Y, at the scale of the quantile loss."""
+    apart = jnp.abs(quantiles[..., :, None] - target[..., None, :]).mean((-2, -1))
+    within = jnp.abs(quantiles[..., :, None] - quantiles[..., None, :]).mean((-2, -1))
+    return 0.5 * quantiles.shape[-1] * (apart - 0.5 * within)
+
+
+def head(obs_size: int, *, order: Callable, distance: Callable | None = None, kappa: float, **options) -> Critic:
+    """A quantile critic with `order` behind its network, fitted by `distance` where it is not the quantile-Huber loss."""
+    plain = quantile(obs_size, kappa=kappa, **options)
+    between = distance or partial(quantile_huber_loss, kappa=kappa)
+
+    def predict(params: Params, obs: Array) -> Quantiles:
+        return order(plain.predict(params, obs))
+
+    def loss(params: Params, batch: Batch):
+        return jnp.where(batch.valid, between(predict(params, batch.obs), batch.target), 0).mean(), {}
+
+    return plain._replace(predict=predict, loss=loss)
+
+
+OPTIONS = CRITICS["quantile"].options
+CRITICS["sorted"] = Part(partial(head, order=jnp.sort), OPTIONS)
+CRITICS["softplus"] = Part(partial(head, order=softplus_steps), OPTIONS)
+CRITICS["energy"] = Part(partial(head, order=softplus_steps, distance=energy_distance), OPTIONS)
+TARGETS["lambda-0.99"] = Part(SR_LAMBDA._replace(lam=0.99))
+
+MEASURED: dict[str, dict] = {
+    "plain": {},
+    "clipped": {"max_grad_norm": 0.005},
+    "sorted": {"kind": "sorted"},
+    "softplus": {"kind": "softplus"},
+    "energy": {"kind": "energy"},
+    "lambda-0.99": {"target": "lambda-0.99"},
+}
+"""Settings of the critic in which each departs from κ = 0.01 and 3 epochs."""
+
+
+def row(task: str, critic: str, seed: int, total_steps: int) -> dict:
+    """Train and calibrate one."""
+    start = dg.preset("tuned", "dppo", task)
+    fitted = dataclasses.replace(start.critic, kappa=0.01, epochs=3, **MEASURED[critic])
+    config = resolve(dataclasses.replace(start, physics="native", seed=seed, total_steps=total_steps, critic=fitted))
+    with TemporaryDirectory() as directory:
+        run = dg.train(config, Path(directory) / "run", quiet=True)
+        found = calibrate(Path(directory) / "run", config, which="newest")
+    return {"task": task, "critic": critic, "seed": seed, "return": run.evaluation["return_mean"], **found}
+
+
+def main() -> None:
+    """Print a line for each run."""
+    arguments = parse(Arguments, "Critics whose quantiles cannot cross.")
+    file = arguments.json
+    rows = json.loads(file.read_text())["rows"] if file and file.exists() else []
+    known = {(each["task"], each["critic"], each["seed"]): each for each in rows}
+    print(f"{'':26s}{'return':>8s}{'in 90 %':>9s}{'crossing':>10s}{'RMSE':>8s}{'spread':>8s}{'CRPS':>8s}")
+    for which in itertools.product(arguments.tasks, arguments.critics, arguments.seeds):
+        if which not in known:
+            known[which] = row(*which, arguments.total_steps)
+            if file:
+                file.write_text(json.dumps({"machine": machine.facts(), "rows": list(known.values())}, indent=1) + "\n")
+        found, (task, critic, seed) = known[which], which
+        shares = f"{found['return']:8,.0f}{found['coverage_90']:9.0%}{found['crossing']:10.0%}"
+        print(f"{task:9s}{critic:12s}{seed:5d}{shares}{found['rmse']:8.3f}{found['spread']:8.3f}{found['crps']:8.3f}", flush=True)
+
+
+if __name__ == "__main__":
+    main()
