@@ -102,7 +102,8 @@ def row(task: str, critic: str, seed: int, total_steps: int) -> dict:
     with TemporaryDirectory() as directory:
         run = dg.train(config, Path(directory) / "run", quiet=True)
         found = calibrate(Path(directory) / "run", config, which="newest")
-    return {"task": task, "critic": critic, "seed": seed, "return": run.evaluation["return_mean"], **found}
+    about = {"task": task, "critic": critic, "seed": seed, "total_steps": total_steps}
+    return {**about, "return": run.evaluation["return_mean"], **found}
 
 
 def main() -> None:
@@ -110,14 +111,14 @@ def main() -> None:
     arguments = parse(Arguments, "Critics whose quantiles cannot cross.")
     file = arguments.json
     rows = json.loads(file.read_text())["rows"] if file and file.exists() else []
-    known = {(each["task"], each["critic"], each["seed"]): each for each in rows}
+    known = {(each["task"], each["critic"], each["seed"], each["total_steps"]): each for each in rows}
     print(f"{'':26s}{'return':>8s}{'in 90 %':>9s}{'crossing':>10s}{'RMSE':>8s}{'spread':>8s}{'CRPS':>8s}")
-    for which in itertools.product(arguments.tasks, arguments.critics, arguments.seeds):
+    for which in itertools.product(arguments.tasks, arguments.critics, arguments.seeds, [arguments.total_steps]):
         if which not in known:
-            known[which] = row(*which, arguments.total_steps)
+            known[which] = row(*which)
             if file:
                 file.write_text(json.dumps({"machine": machine.facts(), "rows": list(known.values())}, indent=1) + "\n")
-        found, (task, critic, seed) = known[which], which
+        found, (task, critic, seed, _) = known[which], which
         shares = f"{found['return']:8,.0f}{found['coverage_90']:9.0%}{found['crossing']:10.0%}"
         print(f"{task:9s}{critic:12s}{seed:5d}{shares}{found['rmse']:8.3f}{found['spread']:8.3f}{found['crps']:8.3f}", flush=True)
 
