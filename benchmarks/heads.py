@@ -2,7 +2,7 @@
 
     python benchmarks/heads.py --json benchmarks/results/heads.json
 
-Each is a part of DPPO that this file puts in the package's tables. Rows that the file has are not trained again.
+Each is a setting of DPPO or a part of it that this file puts in the package's tables. Rows that the file has are not trained again.
 """
 
 import dataclasses
@@ -26,12 +26,12 @@ from dgae_jax.configs.parts import CRITICS, TARGETS, Part
 from dgae_jax.learn.critics import SR_LAMBDA, quantile
 from dgae_jax.learn.types import Batch, Critic, Params
 from dgae_jax.maths.statistics import crps
-from dgae_jax.maths.transport import quantile_huber_loss
+from dgae_jax.maths.transport import in_order, quantile_huber_loss
 from dgae_jax.run import machine
 from dgae_jax.run.calibration import calibrate
 
 Quantiles = Float[Array, "*batch K"]
-Name = Literal["plain", "clipped", "sorted", "softplus", "crps", "lambda-0.99"]
+Name = Literal["preset", "plain", "clipped", "sorted", "softplus", "crps", "lambda-0.99", "scaled", "unsplit", "ordered", "ordered-0.01"]
 
 
 @dataclass(frozen=True)
@@ -39,7 +39,7 @@ class Arguments:
     """What to train."""
 
     critics: tuple[Name, ...] = get_args(Name)
-    """Critics, all with kappa 0.01 and 3 epochs."""
+    """Critics."""
     tasks: tuple[str, ...] = ("hopper",)
     """Tasks."""
     seeds: tuple[int, ...] = (1001, 1002)
@@ -48,13 +48,6 @@ class Arguments:
     """Samples of a run [samples]."""
     json: Path | None = None
     """File to keep the numbers in [path]."""
-
-
-def softplus_steps(x: Quantiles) -> Quantiles:
-    """The first output is the mean, the others are the steps from a quantile to the next, at first about 0.007."""
-    steps = jnp.cumsum(jax.nn.softplus(x[..., 1:] - 5), -1)
-    steps = jnp.concatenate([jnp.zeros_like(x[..., :1]), steps], -1)
-    return x[..., :1] + steps - steps.mean(-1, keepdims=True)
 
 
 def mean_crps(quantiles: Quantiles, target: Quantiles) -> Float[Array, "*batch"]:
@@ -76,27 +69,41 @@ def head(obs_size: int, *, order: Callable, distance: Callable | None = None, ka
     return plain._replace(predict=predict, loss=loss)
 
 
+def over_kappa(quantiles: Quantiles, target: Quantiles) -> Float[Array, "*batch"]:
+    """The quantile-Huber loss as Dabney et al. 2018 have it, divided by κ."""
+    return quantile_huber_loss(quantiles, target, kappa=SHARP) / SHARP
+
+
+SHARP = CRITICS["ordered"].options["kappa"]
 OPTIONS = CRITICS["quantile"].options
 CRITICS["sorted"] = Part(partial(head, order=jnp.sort), OPTIONS)
-CRITICS["softplus"] = Part(partial(head, order=softplus_steps), OPTIONS)
-CRITICS["crps"] = Part(partial(head, order=softplus_steps, distance=mean_crps), OPTIONS)
+CRITICS["softplus"] = Part(partial(head, order=in_order), OPTIONS)
+CRITICS["crps"] = Part(partial(head, order=in_order, distance=mean_crps), OPTIONS)
+CRITICS["scaled"] = Part(partial(head, order=jnp.asarray, distance=over_kappa), OPTIONS)
+CRITICS["unsplit"] = Part(partial(head, order=in_order, distance=over_kappa), OPTIONS)
 TARGETS["lambda-0.99"] = Part(SR_LAMBDA._replace(lam=0.99))
 
+NARROW = {"kind": "quantile", "kappa": 0.01, "epochs": 3}
 MEASURED: dict[str, dict] = {
-    "plain": {},
-    "clipped": {"max_grad_norm": 0.005},
-    "sorted": {"kind": "sorted"},
-    "softplus": {"kind": "softplus"},
-    "crps": {"kind": "crps"},
-    "lambda-0.99": {"target": "lambda-0.99"},
+    "preset": {"kind": "quantile"},
+    "plain": NARROW,
+    "clipped": NARROW | {"max_grad_norm": 0.005},
+    "sorted": NARROW | {"kind": "sorted"},
+    "softplus": NARROW | {"kind": "softplus"},
+    "crps": NARROW | {"kind": "crps"},
+    "lambda-0.99": NARROW | {"target": "lambda-0.99"},
+    "scaled": {"kind": "scaled"},
+    "unsplit": {"kind": "unsplit"},
+    "ordered": {"kind": "ordered"},
+    "ordered-0.01": {"kind": "ordered", "kappa": 0.01},
 }
-"""Settings of the critic in which each departs from κ = 0.01 and 3 epochs."""
+"""Settings of the critic in which each departs from the preset."""
 
 
 def row(task: str, critic: str, seed: int, total_steps: int) -> dict:
     """Train and calibrate one."""
     start = dg.preset("tuned", "dppo", task)
-    fitted = dataclasses.replace(start.critic, kappa=0.01, epochs=3, **MEASURED[critic])
+    fitted = dataclasses.replace(start.critic, **MEASURED[critic])
     config = resolve(dataclasses.replace(start, physics="native", seed=seed, total_steps=total_steps, critic=fitted))
     with TemporaryDirectory() as directory:
         run = dg.train(config, Path(directory) / "run", quiet=True)

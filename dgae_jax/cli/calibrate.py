@@ -12,6 +12,7 @@ import tyro
 
 from dgae_jax.cli.arguments import fail, parse
 from dgae_jax.configs.config import Config, ConfigError, invalid, resolve
+from dgae_jax.configs.parts import is_distribution
 from dgae_jax.run import directory, files, terminal
 from dgae_jax.run.options import RunOptions
 
@@ -65,7 +66,7 @@ def _checked(arguments: Arguments) -> dict[Path, Config]:
         raise ConfigError(f"RUN_DIRS {' '.join(names)}: must be directories of different names, by which their statistics are known")
     runs = {path: resolve(directory.read_config(path)) for path in arguments.run_dirs}
     for path, config in runs.items():
-        if config.critic.kind != "quantile":
+        if not is_distribution(str(config.critic.kind)):
             raise ConfigError(f"{path}: must be a run with a value distribution, not {config.algo}")
         if not 0 <= arguments.index < config.num_seeds:
             raise invalid("index", arguments.index, f"a whole number from 0 to {config.num_seeds - 1}, the index of a seed in {path}")

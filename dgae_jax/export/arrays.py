@@ -1,8 +1,10 @@
 """A trained policy and its critic as plain arrays by name, all that is needed to act: what every exported file is made of.
 
 `policy_weight_I` [inputs, outputs] and `policy_bias_I` are the layers from the first to the last, likewise the critic's; tanh stands
-between layers. Observations are normalised before: (obs - `observation_mean`) / `observation_std`, clipped to ± `observation_limit`.
-Actions are clipped to `action_low` … `action_high`. `env` is Gymnasium's name of the task, `episode_length` its time limit.
+between layers. Where there is `critic_steps` [K - 1, K], the critic's first output is the mean of its quantiles, to which
+log(1 + exp(the others)) @ `critic_steps` is added. Observations are normalised before: (obs - `observation_mean`) / `observation_std`,
+clipped to ± `observation_limit`. Actions are clipped to `action_low` … `action_high`. `env` is Gymnasium's name of the task,
+`episode_length` its time limit.
 """
 
 import io
@@ -15,6 +17,7 @@ from dgae_jax.configs.build import make_task
 from dgae_jax.configs.config import Config, ConfigError
 from dgae_jax.export.outside import policy as outside
 from dgae_jax.learn.normalizers import OBSERVATION_LIMIT
+from dgae_jax.maths.transport import NARROW, about_the_mean
 from dgae_jax.run.api import Policy
 from dgae_jax.run.engines import referee
 from dgae_jax.run.evaluation import time_limit
@@ -36,6 +39,8 @@ def arrays_of(found: Trained, config: Config, index: int) -> Arrays:
     low, high = env.action_range
     try:
         layers = {**_layers("policy", policy.params), **_layers("critic", critic.params)}
+        if config.critic.kind == "ordered":
+            layers |= _in_order(layers)
     except KeyError as name:
         raise _foreign(found, f"{name} is missing") from name
     arrays = {
@@ -72,6 +77,13 @@ def _layers(network: str, params: Any) -> Arrays:
     layers = [*(torso[f"Dense_{i}"] for i in range(len(torso))), head]
     parts = {"weight": "kernel", "bias": "bias"}
     return {f"{network}_{ours}_{i}": np.asarray(layer[name]) for i, layer in enumerate(layers) for ours, name in parts.items()}
+
+
+def _in_order(layers: Arrays) -> Arrays:
+    """What makes the critic's outputs quantiles in order (`maths.transport.in_order`): its last bias, and the matrix of the steps."""
+    last = [name for name in layers if name.startswith("critic_bias_")][-1]
+    narrow = layers[last] - np.float32(NARROW) * (np.arange(layers[last].size) > 0)
+    return {last: narrow.astype(np.float32), "critic_steps": np.asarray(about_the_mean(narrow.size), np.float32)}
 
 
 def _compare(arrays: Arrays, policy: Policy, found: Trained) -> None:

@@ -25,6 +25,8 @@ def model(arrays: dict[str, np.ndarray], about: Mapping[str, str]) -> bytes:
 
     limit = arrays["observation_limit"]
     constants = {name: x for name, x in arrays.items() if x.dtype == np.float32} | {"observation_lowest": -limit}
+    if "critic_steps" in arrays:
+        constants["critic_parts"] = np.array([1, len(arrays["critic_steps"])])
     nodes = [
         helper.make_node("Sub", ["obs", "observation_mean"], ["centred"]),
         helper.make_node("Div", ["centred", "observation_std"], ["scaled"]),
@@ -32,7 +34,7 @@ def model(arrays: dict[str, np.ndarray], about: Mapping[str, str]) -> bytes:
         *_network("policy", arrays, "mean"),
         helper.make_node("Max", ["mean", "action_low"], ["not_too_low"]),  # Clip has one range for all actuators
         helper.make_node("Min", ["not_too_low", "action_high"], ["action"]),
-        *_network("critic", arrays, "quantiles"),
+        *_critic(arrays),
     ]
     quantiles = list(arrays[f"critic_bias_{_layers('critic', arrays) - 1}"].shape)
     graph = helper.make_graph(
@@ -63,6 +65,21 @@ def _network(network: str, arrays: dict[str, np.ndarray], output: str) -> list[A
         nodes += [helper.make_node("Tanh", [linear], [after])]
         before = after
     return [*nodes, helper.make_node("Gemm", [before, f"{network}_weight_{last}", f"{network}_bias_{last}"], [output])]
+
+
+def _critic(arrays: dict[str, np.ndarray]) -> list[Any]:
+    """Its network, whose mean and steps are made quantiles where it gives these."""
+    from onnx import helper
+
+    if "critic_steps" not in arrays:
+        return _network("critic", arrays, "quantiles")
+    return [
+        *_network("critic", arrays, "mean_and_steps"),
+        helper.make_node("Split", ["mean_and_steps", "critic_parts"], ["mean_return", "log_steps"], axis=-1),
+        helper.make_node("Softplus", ["log_steps"], ["steps"]),
+        helper.make_node("MatMul", ["steps", "critic_steps"], ["about_the_mean"]),
+        helper.make_node("Add", ["mean_return", "about_the_mean"], ["quantiles"]),
+    ]
 
 
 def _batch(name: str, shape: Any) -> Any:

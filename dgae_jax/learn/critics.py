@@ -17,7 +17,7 @@ from dgae_jax.maths.returns import (
     sr_lambda_target,
     td_residual,
 )
-from dgae_jax.maths.transport import quantile_huber_loss
+from dgae_jax.maths.transport import in_order, quantile_huber_loss
 
 
 class Target(NamedTuple):
@@ -58,19 +58,24 @@ MONTE_CARLO = Target(_sr_lambda, lam=1.0)
 LAMBDA_RETURN = Target(_lambda_return)
 
 
-def _critic(obs_size: int, outputs: int, hidden: Sequence[int], torso: Callable, target: Target, distance: Callable) -> Critic:
+def _critic(
+    obs_size: int, outputs: int, hidden: Sequence[int], torso: Callable, target: Target, distance: Callable, head: Callable = jnp.asarray
+) -> Critic:
     network = value_network(obs_size, outputs, hidden=hidden, torso=torso)
+
+    def predict(params: Params, obs: Array) -> Array:
+        return head(network.apply(params, obs))
 
     def fitted_to(params: Params, batch: Batch) -> Array:
         if not target.recompute:
             return batch.target
-        following = jax.lax.stop_gradient(network.apply(params, batch.next_obs))
+        following = jax.lax.stop_gradient(predict(params, batch.next_obs))
         return target.compute(None, batch.reward, batch.discount, None, None, following)
 
     def loss(params: Params, batch: Batch):
-        return jnp.where(batch.valid, distance(network.apply(params, batch.obs), fitted_to(params, batch)), 0).mean(), {}
+        return jnp.where(batch.valid, distance(predict(params, batch.obs), fitted_to(params, batch)), 0).mean(), {}
 
-    return Critic(network.init, network.apply, target.compute, loss, target.lam)
+    return Critic(network.init, predict, target.compute, loss, target.lam)
 
 
 def scalar(obs_size: int, *, hidden: Sequence[int], target: Target, torso: Callable = Torso) -> Critic:
@@ -89,6 +94,21 @@ def quantile(obs_size: int, *, hidden: Sequence[int], target: Target, quantiles:
         return quantile_huber_loss(quantiles, target, kappa=kappa)
 
     return _critic(obs_size, quantiles, hidden, torso, target, distance)
+
+
+def ordered(obs_size: int, *, hidden: Sequence[int], target: Target, quantiles: int, kappa: ArrayLike, torso: Callable = Torso) -> Critic:
+    """F⁻¹ of the return at K midpoints `in_order`: their mean is fitted by half the squared error, as V(s) is, and their shape about it
+    by the quantile-Huber loss over κ (Dabney et al. 2018), which for κ → 0 is K/2 times the CRPS; `torso` as for `scalar`.
+    """
+
+    def distance(quantiles: Float[Array, "B K"], target: Float[Array, "B J"]) -> Float[Array, " B"]:
+        mean = quantiles.mean(-1, keepdims=True)
+        shape = quantiles - mean + jax.lax.stop_gradient(mean)
+        error = mean[..., 0] - target.mean(-1)
+        alike = quantiles.shape[-1] / 2  # the weight of the quantile-Huber loss of K equal quantiles, Σᵢ τ̂ᵢ
+        return alike * 0.5 * error**2 + quantile_huber_loss(shape, target, kappa=kappa) / kappa
+
+    return _critic(obs_size, quantiles, hidden, torso, target, distance, head=in_order)
 
 
 def td(weights: ArrayLike | None) -> Callable[..., Array]:

@@ -20,6 +20,23 @@ def quantile_midpoints(k: int) -> Float[Array, " K"]:
     return (2 * jnp.arange(k) + 1) / (2 * k)
 
 
+NARROW = 5.0
+"""Subtracted from what a network says of a step between quantiles, so that they begin 0.0067 apart."""
+
+
+def about_the_mean(k: int) -> Float[Array, "steps K"]:
+    """The matrix [K − 1, K] that makes K quantiles, less their mean, of the steps from each to the next."""
+    step, at = jnp.arange(1, k)[:, None], jnp.arange(k)
+    return (at >= step) - (k - step) / k
+
+
+def in_order(outputs: Float[Array, "*batch K"]) -> Float[Array, "*batch K"]:
+    """K quantiles that do not cross, but for rounding: the first output is their mean, log(1 + exp(outputᵢ − `NARROW`)) the step from
+    quantile i − 1 to quantile i.
+    """
+    return outputs[..., :1] + jax.nn.softplus(outputs[..., 1:] - NARROW) @ about_the_mean(outputs.shape[-1])
+
+
 def spectral_weights(weights: ArrayLike) -> Float[Array, " K"]:
     """Weights that keep the directional metric translation and scale equivariant, on which the theorem's telescoping rests.
 

@@ -31,7 +31,7 @@ def episodes(end):
 
 def fixed_point(kind, target, lam, end="terminal"):
     """The quantiles of a table (a linear network on one-hot observations) after fitting one target for long."""
-    options = {"quantiles": 4, "kappa": 1e-2} if kind == "quantile" else {}
+    options = {} if kind == "scalar" else {"quantiles": 4, "kappa": 1e-2}
     critic = CRITICS[kind].build(3, hidden=(), target=TARGETS[target].build, **options)
     obs, reward, terminated, next_obs = episodes(end)
     lam = lam if critic.lam is None else critic.lam
@@ -56,6 +56,7 @@ def fixed_point(kind, target, lam, end="terminal"):
     return {name: jnp.sort(critic.predict(params, x)) for name, x in (("first", FIRST), ("second", SECOND), ("end", END))}
 
 
+@pytest.mark.parametrize("kind", ["quantile", "ordered"])
 @pytest.mark.parametrize("end", ["terminal", "absorbing"])
 @pytest.mark.parametrize(
     ("target", "lam"),
@@ -69,8 +70,8 @@ def fixed_point(kind, target, lam, end="terminal"):
         ("monte-carlo", 0.0),
     ],
 )
-def test_the_critic_learns_the_true_quantiles(target, lam, end):
-    got = fixed_point("quantile", target, lam, end)
+def test_the_critic_learns_the_true_quantiles(kind, target, lam, end):
+    got = fixed_point(kind, target, lam, end)
     assert_allclose(got["first"], TRUE["first"], atol=0.1)
     assert_allclose(got["second"], TRUE["second"], atol=0.1)
 

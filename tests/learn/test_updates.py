@@ -4,7 +4,8 @@ import optax
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
-from dgae_jax.configs.parts import TARGETS
+import dgae_jax as dg
+from dgae_jax.configs.parts import CRITICS, TARGETS
 from dgae_jax.learn import critics
 from dgae_jax.learn.networks import SharedCovariance, StateCovariance, gaussian_policy
 from dgae_jax.learn.types import Batch, Fit
@@ -136,8 +137,8 @@ def test_the_clip_bounds_the_global_norm_of_a_gradient():
 
 
 def critic_of(kind, target):
-    options = {"hidden": (8,), "target": TARGETS[target].build}
-    return critics.scalar(3, **options) if kind == "scalar" else critics.quantile(3, **options, quantiles=4, kappa=1.0)
+    options = {} if kind == "scalar" else {"quantiles": 4, "kappa": 1.0}
+    return CRITICS[kind].build(3, hidden=(8,), target=TARGETS[target].build, **options)
 
 
 def test_an_invalid_sample_weighs_nothing_in_policy_and_critic(policy, params, batch, key):
@@ -157,7 +158,7 @@ def test_an_invalid_sample_weighs_nothing_in_policy_and_critic(policy, params, b
     assert surrogate(policy)(params, broken)[1]["kl"] == 0
 
 
-@pytest.mark.parametrize("kind", ["scalar", "quantile"])
+@pytest.mark.parametrize("kind", CRITICS)
 @pytest.mark.parametrize("target", TARGETS)
 def test_every_critic_takes_every_target(kind, target, key):
     critic = critic_of(kind, target)
@@ -188,6 +189,27 @@ def test_no_gradient_flows_through_the_bellman_target(batch, key):
     target = batch.reward[:, None] + batch.discount[:, None] * critic.predict(params, batch.next_obs)
     want = jax.grad(lambda p: (0.5 * (critic.predict(p, batch.obs) - target) ** 2).mean())(params)
     assert distance(jax.grad(critic.loss, has_aux=True)(params, batch)[0], want) < 1e-6
+
+
+def test_ordered_quantiles_are_fitted_in_the_mean_as_a_scalar_and_in_shape_by_the_crps(batch, key):
+    critic = critics.ordered(3, hidden=(), target=critics.BELLMAN_FROZEN, quantiles=8, kappa=1e-5)
+    params, target = critic.init(key), jax.random.normal(key, (24, 5))
+    at = batch._replace(obs=jnp.zeros((24, 3)), target=target)
+
+    def by_output(loss):
+        """Its derivative by the outputs of the network, which on observations of zero are the biases of its only layer."""
+        return jax.grad(loss)(params)["params"]["Dense_0"]["bias"]
+
+    def mean(p):
+        return 8 / 2 * (0.5 * (critic.predict(p, at.obs).mean(-1) - target.mean(-1)) ** 2).mean()
+
+    def shape(p):
+        z = critic.predict(p, at.obs)
+        return 8 / 2 * jax.vmap(dg.crps, (None, -1))(z, target).mean()
+
+    got = by_output(lambda p: critic.loss(p, at)[0])
+    assert_allclose(got[0], by_output(mean)[0], rtol=1e-5)
+    assert_allclose(got[1:], by_output(shape)[1:], rtol=1e-3, atol=1e-6)
 
 
 # ---- policy networks ----

@@ -6,7 +6,7 @@ import scipy.stats
 from numpy.testing import assert_allclose
 
 import dgae_jax as dg
-from dgae_jax.maths.transport import huber
+from dgae_jax.maths.transport import huber, in_order
 
 CVAR_HALF = jnp.array([2.0, 2.0, 0.0, 0.0])  # mean of the worse half
 
@@ -83,6 +83,22 @@ def test_wasserstein_agrees_with_scipy(p, key):
 def test_wasserstein_of_order_below_one_is_refused():
     with pytest.raises(ValueError, match="at least 1"):
         dg.wasserstein(jnp.zeros(2), jnp.zeros(2), 0.5)
+
+
+def test_quantiles_in_order_by_hand():
+    # steps of log(1 + e^0) = log 2 and log(1 + e^log 3) = log 4 about the mean 1: they start at 1 - (2 log 2 + log 4) / 3
+    first = 1 - 4 * np.log(2) / 3
+    want = [first, first + np.log(2), first + 3 * np.log(2)]
+    assert_allclose(in_order(jnp.array([1.0, 5.0, 5.0 + np.log(3)])), want, rtol=1e-6)
+
+
+@pytest.mark.parametrize("k", [1, 2, 64])
+def test_quantiles_in_order_do_not_cross_and_have_the_mean_that_they_are_given(k, key):
+    outputs = 10 * jax.random.normal(key, (100, k))
+    z = in_order(outputs)
+    assert z.shape == (100, k)
+    assert float(jnp.diff(z).min(initial=1)) > -1e-5
+    assert_allclose(z.mean(-1), outputs[:, 0], atol=1e-4)
 
 
 def test_huber_is_quadratic_inside_and_linear_outside_by_hand():

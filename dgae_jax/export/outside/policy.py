@@ -18,7 +18,10 @@ class Policy:
 
     def quantiles(self, obs: Any) -> np.ndarray:
         """The critic's quantiles [..., K] of the discounted return, K = 1 for a scalar critic, in the units it was trained in."""
-        return self._outputs("critic", obs)
+        outputs = self._outputs("critic", obs)
+        if "critic_steps" not in self.arrays:
+            return outputs
+        return outputs[..., :1] + np.logaddexp(np.float32(0), outputs[..., 1:]) @ self.arrays["critic_steps"]
 
     def _outputs(self, network: str, obs: Any) -> np.ndarray:
         a = self.arrays
