@@ -31,7 +31,7 @@ from dgae_jax.run import machine
 from dgae_jax.run.calibration import calibrate
 
 Quantiles = Float[Array, "*batch K"]
-Name = Literal["preset", "plain", "clipped", "sorted", "softplus", "crps", "lambda-0.99", "scaled", "unsplit", "ordered", "ordered-0.01"]
+Name = Literal["quantile", "plain", "clipped", "sorted", "softplus", "crps", "lambda-0.99", "scaled", "unsplit", "ordered", "ordered-0.01"]
 
 
 @dataclass(frozen=True)
@@ -85,7 +85,7 @@ TARGETS["lambda-0.99"] = Part(SR_LAMBDA._replace(lam=0.99))
 
 NARROW = {"kind": "quantile", "kappa": 0.01, "epochs": 3}
 MEASURED: dict[str, dict] = {
-    "preset": {"kind": "quantile"},
+    "quantile": {"kind": "quantile"},
     "plain": NARROW,
     "clipped": NARROW | {"max_grad_norm": 0.005},
     "sorted": NARROW | {"kind": "sorted"},

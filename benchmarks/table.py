@@ -1,4 +1,4 @@
-"""A file of throughput.py as a Markdown table: python benchmarks/table.py benchmarks/results/hopper-64.json"""
+"""A file of throughput.py or heads.py as a Markdown table: python benchmarks/table.py benchmarks/results/hopper-64.json"""
 
 import json
 import sys
@@ -20,6 +20,22 @@ def rival_of(row: dict, peers: list[dict]) -> dict | None:
 
 
 def table(found: dict) -> str:
+    """Of whichever file it is."""
+    return critics(found["rows"]) if "rows" in found else speeds(found)
+
+
+def critics(rows: list[dict]) -> str:
+    """A row per critic, task and seed."""
+    lines = ["| critic | task, seed | return | in 90 % | crossing | RMSE | spread | CRPS |", "|---|---|---:|---:|---:|---:|---:|---:|"]
+    order = list(dict.fromkeys(row["critic"] for row in rows))
+    for row in sorted(rows, key=lambda row: (order.index(row["critic"]), row["task"], row["seed"])):
+        shares = f"{row['return']:,.0f} | {100 * row['coverage_90']:.0f} % | {100 * row['crossing']:.0f} %"
+        errors = " | ".join(f"{row[name]:.3f}" for name in ("rmse", "spread", "crps"))
+        lines.append(f"| {row['critic']} | {row['task'].capitalize()}, {row['seed']} | {shares} | {errors} |")
+    return "\n".join(lines)
+
+
+def speeds(found: dict) -> str:
     """A row per algorithm and engine, then every peer in its fastest layout."""
     lines = ["| | compile | steps/s | over the peer | of the roofline |", "|---|---|---|---|---|"]
     tasks = {(row["task"], row["width"]) for row in found["ours"]}
