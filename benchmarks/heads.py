@@ -31,7 +31,7 @@ from dgae_jax.run import machine
 from dgae_jax.run.calibration import calibrate
 
 Quantiles = Float[Array, "*batch K"]
-Name = Literal["quantile", "plain", "clipped", "sorted", "softplus", "crps", "lambda-0.99", "scaled", "unsplit", "ordered", "ordered-0.01"]
+Name = Literal["quantile", "plain", "clipped", "sorted", "softplus", "crps", "lambda-0.99", "scaled", "heavy", "heavy-0.01", "ordered"]
 
 
 @dataclass(frozen=True)
@@ -69,6 +69,23 @@ def head(obs_size: int, *, order: Callable, distance: Callable | None = None, ka
     return plain._replace(predict=predict, loss=loss)
 
 
+def heavy(obs_size: int, *, kappa: float, **options) -> Critic:
+    """`ordered` with the whole weight on the shape, which is fitted about the mean as it is."""
+    plain = quantile(obs_size, kappa=kappa, **options)
+
+    def predict(params: Params, obs: Array) -> Quantiles:
+        return in_order(plain.predict(params, obs))
+
+    def loss(params: Params, batch: Batch):
+        quantiles = predict(params, batch.obs)
+        mean = quantiles.mean(-1, keepdims=True)
+        shape = quantile_huber_loss(quantiles - mean + jax.lax.stop_gradient(mean), batch.target, kappa=kappa) / kappa
+        error = mean[..., 0] - batch.target.mean(-1)
+        return jnp.where(batch.valid, quantiles.shape[-1] / 4 * error**2 + shape, 0).mean(), {}
+
+    return plain._replace(predict=predict, loss=loss)
+
+
 def over_kappa(quantiles: Quantiles, target: Quantiles) -> Float[Array, "*batch"]:
     """The quantile-Huber loss as Dabney et al. 2018 have it, divided by κ."""
     return quantile_huber_loss(quantiles, target, kappa=SHARP) / SHARP
@@ -80,7 +97,7 @@ CRITICS["sorted"] = Part(partial(head, order=jnp.sort), OPTIONS)
 CRITICS["softplus"] = Part(partial(head, order=in_order), OPTIONS)
 CRITICS["crps"] = Part(partial(head, order=in_order, distance=mean_crps), OPTIONS)
 CRITICS["scaled"] = Part(partial(head, order=jnp.asarray, distance=over_kappa), OPTIONS)
-CRITICS["unsplit"] = Part(partial(head, order=in_order, distance=over_kappa), OPTIONS)
+CRITICS["heavy"] = Part(heavy, CRITICS["ordered"].options)
 TARGETS["lambda-0.99"] = Part(SR_LAMBDA._replace(lam=0.99))
 
 NARROW = {"kind": "quantile", "kappa": 0.01, "epochs": 3}
@@ -93,9 +110,9 @@ MEASURED: dict[str, dict] = {
     "crps": NARROW | {"kind": "crps"},
     "lambda-0.99": NARROW | {"target": "lambda-0.99"},
     "scaled": {"kind": "scaled"},
-    "unsplit": {"kind": "unsplit"},
+    "heavy": {"kind": "heavy"},
+    "heavy-0.01": {"kind": "heavy", "kappa": 0.01},
     "ordered": {"kind": "ordered"},
-    "ordered-0.01": {"kind": "ordered", "kappa": 0.01},
 }
 """Settings of the critic in which each departs from the preset."""
 

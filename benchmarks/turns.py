@@ -149,7 +149,7 @@ def of_update(algo: str) -> list[list[int]]:
     action, row = jax.random.normal(key, (size, env.action_size)), jax.random.normal(key, (size,))
     quantiles = algorithm.critic.predict(algorithm.critic.init(key), obs)
     log_prob = jnp.zeros(size) - env.action_size
-    batch = Batch(obs, action, log_prob, row, quantiles, row, row, next_obs, jnp.ones(size, bool))
+    batch = Batch(obs, action, log_prob, row, row, quantiles, row, row, next_obs, jnp.ones(size, bool))
     found = []
     for network, update in ((algorithm.policy, algorithm.policy_update), (algorithm.critic, algorithm.critic_update)):
         params = network.init(key)

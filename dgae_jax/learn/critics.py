@@ -73,7 +73,8 @@ def _critic(
         return target.compute(None, batch.reward, batch.discount, None, None, following)
 
     def loss(params: Params, batch: Batch):
-        return jnp.where(batch.valid, distance(predict(params, batch.obs), fitted_to(params, batch)), 0).mean(), {}
+        apart = distance(predict(params, batch.obs), fitted_to(params, batch), batch.value)
+        return jnp.where(batch.valid, apart, 0).mean(), {}
 
     return Critic(network.init, predict, target.compute, loss, target.lam)
 
@@ -81,7 +82,7 @@ def _critic(
 def scalar(obs_size: int, *, hidden: Sequence[int], target: Target, torso: Callable = Torso) -> Critic:
     """V(s), fitted by half the squared error; `torso` is the flax module of its `hidden` layers."""
 
-    def distance(value: Float[Array, "B 1"], target: Float[Array, "B 1"]) -> Float[Array, " B"]:
+    def distance(value: Float[Array, "B 1"], target: Float[Array, "B 1"], before: Float[Array, " B"]) -> Float[Array, " B"]:
         return 0.5 * ((value - target) ** 2).mean(-1)
 
     return _critic(obs_size, 1, hidden, torso, target, distance)
@@ -90,23 +91,27 @@ def scalar(obs_size: int, *, hidden: Sequence[int], target: Target, torso: Calla
 def quantile(obs_size: int, *, hidden: Sequence[int], target: Target, quantiles: int, kappa: ArrayLike, torso: Callable = Torso) -> Critic:
     """F⁻¹ of the return at K midpoints, fitted by the quantile-Huber loss (Eq. quantile_huber_loss); `torso` as for `scalar`."""
 
-    def distance(quantiles: Float[Array, "B K"], target: Float[Array, "B J"]) -> Float[Array, " B"]:
+    def distance(quantiles: Float[Array, "B K"], target: Float[Array, "B J"], before: Float[Array, " B"]) -> Float[Array, " B"]:
         return quantile_huber_loss(quantiles, target, kappa=kappa)
 
     return _critic(obs_size, quantiles, hidden, torso, target, distance)
 
 
+_OF_SHAPE = 1 / 64
+"""Weight of the shape beside the mean, so small that it hardly moves the layers which both share."""
+
+
 def ordered(obs_size: int, *, hidden: Sequence[int], target: Target, quantiles: int, kappa: ArrayLike, torso: Callable = Torso) -> Critic:
-    """F⁻¹ of the return at K midpoints `in_order`: their mean is fitted by half the squared error, as V(s) is, and their shape about it
-    by the quantile-Huber loss over κ (Dabney et al. 2018), which for κ → 0 is K/2 times the CRPS; `torso` as for `scalar`.
+    """F⁻¹ of the return at K midpoints `in_order`: their mean is fitted as V(s) is, by half the squared error, and their shape to how far
+    the targets lie from the mean that was predicted before the rollout was learned from, by the quantile-Huber loss over κ (Dabney et
+    al. 2018); `torso` as for `scalar`.
     """
 
-    def distance(quantiles: Float[Array, "B K"], target: Float[Array, "B J"]) -> Float[Array, " B"]:
-        mean = quantiles.mean(-1, keepdims=True)
-        shape = quantiles - mean + jax.lax.stop_gradient(mean)
-        error = mean[..., 0] - target.mean(-1)
-        alike = quantiles.shape[-1] / 2  # the weight of the quantile-Huber loss of K equal quantiles, Σᵢ τ̂ᵢ
-        return alike * 0.5 * error**2 + quantile_huber_loss(shape, target, kappa=kappa) / kappa
+    def distance(quantiles: Float[Array, "B K"], target: Float[Array, "B J"], before: Float[Array, " B"]) -> Float[Array, " B"]:
+        mean = quantiles.mean(-1)
+        shape = quantile_huber_loss(quantiles - mean[:, None], target - before[:, None], kappa=kappa) / kappa
+        scale = quantiles.shape[-1] / 2  # of the quantile-Huber loss of K equal quantiles, Σᵢ τ̂ᵢ
+        return scale * 0.5 * (mean - target.mean(-1)) ** 2 + _OF_SHAPE * shape
 
     return _critic(obs_size, quantiles, hidden, torso, target, distance, head=in_order)
 

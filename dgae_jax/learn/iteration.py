@@ -134,8 +134,8 @@ def _estimate(
     target = algorithm.critic.target(key, reward, discount, reach, quantiles, next_quantiles)
     mean, std = advantage.mean(where=step.valid), advantage.std(where=step.valid)
     standard = jnp.where(step.valid, (advantage - mean) / (std + 1e-8), 0)
-    batch = Batch(obs, step.action, step.log_prob, standard, target, reward, discount, next_obs, step.valid)
     value = quantiles.mean(-1)
+    batch = Batch(obs, step.action, step.log_prob, standard, value, target, reward, discount, next_obs, step.valid)
     continues = 1.0 - (step.terminated | step.truncated)
     metrics = {
         "critic/value": value.mean(),

@@ -36,6 +36,8 @@ class Batch(NamedTuple):
     action: Float[Array, "B A"]
     log_prob: Float[Array, " B"]
     advantage: Float[Array, " B"]
+    value: Float[Array, " B"]
+    """The mean that the critic predicted which acted."""
     target: Float[Array, "B J"]
     reward: Float[Array, " B"]
     discount: Float[Array, " B"]

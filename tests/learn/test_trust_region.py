@@ -26,9 +26,8 @@ def example(seed=0, count=200):
     action = gaussian.sample(key, here)
     advantage = jnp.sin(action[:, 0] + obs[:, 1]) - 0.5 * action[:, 1] ** 2
     advantage = (advantage - advantage.mean()) / advantage.std()
-    return params, Batch(
-        obs, action, gaussian.log_prob(here, action), advantage, advantage[:, None], advantage, advantage, obs, jnp.ones(count, bool)
-    )
+    column, valid = advantage[:, None], jnp.ones(count, bool)
+    return params, Batch(obs, action, gaussian.log_prob(here, action), advantage, advantage, column, advantage, advantage, obs, valid)
 
 
 SEARCH = {"damping": 0.1, "cg_iterations": 30, "backtracks": 10, "fisher_every": 1}

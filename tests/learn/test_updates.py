@@ -31,7 +31,7 @@ def batch(policy, params, key):
     action = gaussian.sample(key, distribution)
     advantage, reward = jax.random.normal(key, (2, 24))
     log_prob = gaussian.log_prob(distribution, action)
-    return Batch(obs, action, log_prob, advantage, advantage[:, None], reward, jnp.full(24, 0.9), next_obs, jnp.ones(24, bool))
+    return Batch(obs, action, log_prob, advantage, advantage, advantage[:, None], reward, jnp.full(24, 0.9), next_obs, jnp.ones(24, bool))
 
 
 @pytest.mark.parametrize("clip", [0.2, jnp.inf])
@@ -168,7 +168,8 @@ def test_every_critic_takes_every_target(kind, target, key):
     got = critic.target(key, reward, factor, factor, z, z_next)
     assert got.shape == (6, 5, 1 if target == "lambda-return" else z.shape[-1])
     empty = jnp.zeros(30)
-    columns = obs.reshape(30, 3), empty[:, None], empty, empty, got.reshape(30, -1), reward.ravel(), factor.ravel(), next_obs.reshape(30, 3)
+    seen, then, fit = obs.reshape(30, 3), next_obs.reshape(30, 3), got.reshape(30, -1)
+    columns = seen, empty[:, None], empty, empty, z.mean(-1).ravel(), fit, reward.ravel(), factor.ravel(), then
     flat = Batch(*columns, valid=jnp.ones(30, bool))
     gradient = jax.grad(critic.loss, has_aux=True)(params, flat)[0]
     assert 0 < float(optax.global_norm(gradient)) < 1e3
@@ -191,10 +192,10 @@ def test_no_gradient_flows_through_the_bellman_target(batch, key):
     assert distance(jax.grad(critic.loss, has_aux=True)(params, batch)[0], want) < 1e-6
 
 
-def test_ordered_quantiles_are_fitted_in_the_mean_as_a_scalar_and_in_shape_by_the_crps(batch, key):
+def test_ordered_quantiles_are_fitted_in_the_mean_as_a_scalar_and_in_shape_by_the_crps_about_the_mean_before(batch, key):
     critic = critics.ordered(3, hidden=(), target=critics.BELLMAN_FROZEN, quantiles=8, kappa=1e-5)
-    params, target = critic.init(key), jax.random.normal(key, (24, 5))
-    at = batch._replace(obs=jnp.zeros((24, 3)), target=target)
+    params, target, before = critic.init(key), jax.random.normal(key, (24, 5)), jnp.linspace(-1, 1, 24)
+    at = batch._replace(obs=jnp.zeros((24, 3)), target=target, value=before)
 
     def by_output(loss):
         """Its derivative by the outputs of the network, which on observations of zero are the biases of its only layer."""
@@ -205,7 +206,8 @@ def test_ordered_quantiles_are_fitted_in_the_mean_as_a_scalar_and_in_shape_by_th
 
     def shape(p):
         z = critic.predict(p, at.obs)
-        return 8 / 2 * jax.vmap(dg.crps, (None, -1))(z, target).mean()
+        about = z - z.mean(-1, keepdims=True) + before[:, None]
+        return 8 / 2 * jax.vmap(dg.crps, (None, -1))(about, target).mean() / 64
 
     got = by_output(lambda p: critic.loss(p, at)[0])
     assert_allclose(got[0], by_output(mean)[0], rtol=1e-5)

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from dgae_jax.cli import calibrate
 from dgae_jax.maths.transport import quantile_midpoints
 from dgae_jax.run import calibration, directory, loop
 from tests import helpers, runs
@@ -61,6 +62,15 @@ def test_what_cannot_be_compared_is_refused_in_one_line(changes, message, tmp_pa
     with pytest.raises(SystemExit, match="2"):
         helpers.command("calibrate")()
     assert message in capsys.readouterr().err
+
+
+def test_the_critics_of_both_kinds_of_quantiles_can_be_compared(tmp_path):
+    plain = runs.small("dppo")
+    made = {"quantile": plain, "ordered": dataclasses.replace(plain, critic=dataclasses.replace(plain.critic, kind="ordered"))}
+    for name, config in made.items():
+        directory.create(tmp_path / name, config, runs.QUIET)
+    checked = calibrate._checked(calibrate.Arguments(tuple(tmp_path / name for name in made)))
+    assert {path.name: config.critic.kind for path, config in checked.items()} == {name: name for name in made}
 
 
 def test_runs_of_the_same_name_are_refused(tmp_path, monkeypatch, capsys):
