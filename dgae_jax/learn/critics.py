@@ -98,7 +98,7 @@ def quantile(obs_size: int, *, hidden: Sequence[int], target: Target, quantiles:
 
 
 _OF_SHAPE = 1 / 64
-"""Weight of the shape beside the mean, so small that it hardly moves the layers which both share."""
+"""Weight of the shape beside the mean, small so as to leave the layers that both share to the mean."""
 
 
 def ordered(obs_size: int, *, hidden: Sequence[int], target: Target, quantiles: int, kappa: ArrayLike, torso: Callable = Torso) -> Critic:
