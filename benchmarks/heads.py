@@ -39,7 +39,7 @@ class Arguments:
     """What to train."""
 
     critics: tuple[Name, ...] = get_args(Name)
-    """Critics."""
+    """Critics, of `MEASURED`."""
     tasks: tuple[str, ...] = ("hopper",)
     """Tasks."""
     seeds: tuple[int, ...] = (1001, 1002)
@@ -50,54 +50,42 @@ class Arguments:
     """File to keep the numbers in [path]."""
 
 
-def mean_crps(quantiles: Quantiles, target: Quantiles) -> Float[Array, "*batch"]:
-    """The CRPS over the targets, at the scale of the quantile loss: half the energy distance up to a constant of the target."""
+def mean_crps(quantiles: Quantiles, target: Quantiles, *, kappa: float) -> Float[Array, "*batch"]:
+    """The CRPS over the targets, at the scale of the quantile loss: half the energy distance up to a constant of the target; no κ."""
     return 0.5 * quantiles.shape[-1] * jax.vmap(crps, (None, -1))(quantiles, target).mean(0)
 
 
-def head(obs_size: int, *, order: Callable, distance: Callable | None = None, kappa: float, **options) -> Critic:
-    """A quantile critic with `order` behind its network, fitted by `distance` where it is not the quantile-Huber loss."""
+def over_kappa(quantiles: Quantiles, target: Quantiles, *, kappa: float) -> Float[Array, "*batch"]:
+    """The quantile-Huber loss as Dabney et al. 2018 have it, divided by κ."""
+    return quantile_huber_loss(quantiles, target, kappa=kappa) / kappa
+
+
+def mean_and_shape(quantiles: Quantiles, target: Quantiles, *, kappa: float) -> Float[Array, "*batch"]:
+    """As the loss of `ordered`, but with the whole weight on the shape, about the mean as it is."""
+    mean = quantiles.mean(-1, keepdims=True)
+    error = mean[..., 0] - target.mean(-1)
+    return quantiles.shape[-1] / 4 * error**2 + over_kappa(quantiles - mean + jax.lax.stop_gradient(mean), target, kappa=kappa)
+
+
+def head(obs_size: int, *, order: Callable = in_order, distance: Callable = quantile_huber_loss, kappa: float, **options) -> Critic:
+    """A quantile critic with `order` behind its network, fitted by `distance`."""
     plain = quantile(obs_size, kappa=kappa, **options)
-    between = distance or partial(quantile_huber_loss, kappa=kappa)
 
     def predict(params: Params, obs: Array) -> Quantiles:
         return order(plain.predict(params, obs))
 
     def loss(params: Params, batch: Batch):
-        return jnp.where(batch.valid, between(predict(params, batch.obs), batch.target), 0).mean(), {}
+        return jnp.where(batch.valid, distance(predict(params, batch.obs), batch.target, kappa=kappa), 0).mean(), {}
 
     return plain._replace(predict=predict, loss=loss)
 
 
-def heavy(obs_size: int, *, kappa: float, **options) -> Critic:
-    """`ordered` with the whole weight on the shape, which is fitted about the mean as it is."""
-    plain = quantile(obs_size, kappa=kappa, **options)
-
-    def predict(params: Params, obs: Array) -> Quantiles:
-        return in_order(plain.predict(params, obs))
-
-    def loss(params: Params, batch: Batch):
-        quantiles = predict(params, batch.obs)
-        mean = quantiles.mean(-1, keepdims=True)
-        shape = quantile_huber_loss(quantiles - mean + jax.lax.stop_gradient(mean), batch.target, kappa=kappa) / kappa
-        error = mean[..., 0] - batch.target.mean(-1)
-        return jnp.where(batch.valid, quantiles.shape[-1] / 4 * error**2 + shape, 0).mean(), {}
-
-    return plain._replace(predict=predict, loss=loss)
-
-
-def over_kappa(quantiles: Quantiles, target: Quantiles) -> Float[Array, "*batch"]:
-    """The quantile-Huber loss as Dabney et al. 2018 have it, divided by κ."""
-    return quantile_huber_loss(quantiles, target, kappa=SHARP) / SHARP
-
-
-SHARP = CRITICS["ordered"].options["kappa"]
-OPTIONS = CRITICS["quantile"].options
+OPTIONS, SHARP = CRITICS["quantile"].options, CRITICS["ordered"].options
 CRITICS["sorted"] = Part(partial(head, order=jnp.sort), OPTIONS)
-CRITICS["softplus"] = Part(partial(head, order=in_order), OPTIONS)
-CRITICS["crps"] = Part(partial(head, order=in_order, distance=mean_crps), OPTIONS)
-CRITICS["scaled"] = Part(partial(head, order=jnp.asarray, distance=over_kappa), OPTIONS)
-CRITICS["heavy"] = Part(heavy, CRITICS["ordered"].options)
+CRITICS["softplus"] = Part(head, OPTIONS)
+CRITICS["crps"] = Part(partial(head, distance=mean_crps), OPTIONS)
+CRITICS["scaled"] = Part(partial(head, order=jnp.asarray, distance=over_kappa), SHARP)
+CRITICS["heavy"] = Part(partial(head, distance=mean_and_shape), SHARP)
 TARGETS["lambda-0.99"] = Part(SR_LAMBDA._replace(lam=0.99))
 
 NARROW = {"kind": "quantile", "kappa": 0.01, "epochs": 3}

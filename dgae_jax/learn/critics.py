@@ -102,7 +102,7 @@ _OF_SHAPE = 1 / 64
 
 
 def ordered(obs_size: int, *, hidden: Sequence[int], target: Target, quantiles: int, kappa: ArrayLike, torso: Callable = Torso) -> Critic:
-    """F⁻¹ of the return at K midpoints `in_order`: their mean is fitted as V(s) is, by half the squared error, and their shape to how far
+    """F⁻¹ of the return at K midpoints `in_order`: their mean is fitted by half the squared error, and their shape to how far
     the targets lie from the mean that was predicted before the rollout was learned from, by the quantile-Huber loss over κ (Dabney et
     al. 2018); `torso` as for `scalar`.
     """
