@@ -65,7 +65,7 @@ def test_a_table_of_measurements_is_what_its_command_prints(path):
         ("docs/results.md", "tuned", ["returns", "improvement", "reach"]),
         ("docs/results.md", "long", ["returns", "improvement"]),
         ("docs/results.md", "swimmer-099", ["returns"]),
-        ("docs/decisions.md", "ordered", ["returns"]),
+        ("docs/decisions.md", "quantile", ["returns"]),
         ("docs/reproduction.md", "paper", ["returns", "improvement"]),
         ("docs/reproduction.md", "paper-one-step", ["returns"]),
         ("docs/attribution.md", "attribution", ["attribution", "attribution-over-tasks"]),
