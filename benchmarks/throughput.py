@@ -32,7 +32,6 @@ from turns import counted
 
 import dgae_jax as dg
 from dgae_jax.cli.arguments import parse
-from dgae_jax.configs.algorithms import TABLE
 from dgae_jax.configs.build import make_task, make_trainer, seed_keys
 from dgae_jax.configs.config import Config, resolve
 from dgae_jax.learn import devices
@@ -93,10 +92,8 @@ def fastest(f: Callable[[], Any], seconds: float) -> float:
 
 
 def setting(task: str, algo: str, physics: str, width: int) -> Config:
-    """The defaults of an algorithm with its own critic on a task, both networks as wide as asked for; A2C takes one step per rollout of 8,
-    as its peer.
-    """
-    config = dg.preset("tuned", algo, task, critic=TABLE[algo].critic)
+    """The defaults of an algorithm on a task, with both networks as wide as asked for; A2C takes one step per rollout of 8, as its peer."""
+    config = dg.preset("tuned", algo, task)
     as_peer = PEER_OF[algo] == "A2C"
     steps = {"optimizer": "rmsprop", "epochs": 1, "minibatches": 1} if as_peer else {}
     policy, critic = (dataclasses.replace(part, hidden=(width, width), **steps) for part in (config.policy, config.critic))

@@ -1,32 +1,29 @@
 """Questions for a study: tables of variants, each an algorithm and the flags in which it departs from its preset."""
 
-_QUANTILE = "dppo --critic.kind quantile"
-"""The paper's critic, whatever the preset has on the task."""
-
 SCALAR = {
     "scalar": "ppo",
     "scalar-one-step": "ppo --critic.target bellman",
-    "huber": f"{_QUANTILE} --critic.quantiles 1 --critic.target lambda-return",
-    "huber-one-step": f"{_QUANTILE} --critic.quantiles 1 --critic.target bellman",
+    "huber": "dppo --critic.quantiles 1 --critic.target lambda-return",
+    "huber-one-step": "dppo --critic.quantiles 1 --critic.target bellman",
 }
 """One value: half the squared error, or the Huber loss, which is what the quantile-Huber loss is for K = 1."""
 
 DISTRIBUTIONAL = {
-    "sr-lambda": _QUANTILE,
-    "lambda-return": f"{_QUANTILE} --critic.target lambda-return",
-    "lambda-shift": f"{_QUANTILE} --critic.target lambda-shift",
-    "bellman": f"{_QUANTILE} --critic.target bellman",
-    "bellman-frozen": f"{_QUANTILE} --critic.target bellman-frozen",
-    "quantiles-1": f"{_QUANTILE} --critic.quantiles 1",
-    "quantiles-8": f"{_QUANTILE} --critic.quantiles 8",
-    "kappa-0.01": f"{_QUANTILE} --critic.kappa 0.01",
-    "kappa-0.1": f"{_QUANTILE} --critic.kappa 0.1",
-    "matched-scale": f"{_QUANTILE} --critic.max-grad-norm 16",
+    "sr-lambda": "dppo",
+    "lambda-return": "dppo --critic.target lambda-return",
+    "lambda-shift": "dppo --critic.target lambda-shift",
+    "bellman": "dppo --critic.target bellman",
+    "bellman-frozen": "dppo --critic.target bellman-frozen",
+    "quantiles-1": "dppo --critic.quantiles 1",
+    "quantiles-8": "dppo --critic.quantiles 8",
+    "kappa-0.01": "dppo --critic.kappa 0.01",
+    "kappa-0.1": "dppo --critic.kappa 0.1",
+    "matched-scale": "dppo --critic.max-grad-norm 16",
 }
 """A distribution. The loss of 64 quantiles is a sum with weights of ½ on average, 32 times the scalar one; Adam does not see the
 scale of a loss, but the bound of the gradient's norm, 0.5, does: 32 · 0.5 = 16 bounds both alike."""
 
-_MONTE_CARLO = f"{_QUANTILE} --critic.target monte-carlo --critic.kappa 0.01 --critic.epochs 3"
+_MONTE_CARLO = "dppo --critic.target monte-carlo --critic.kappa 0.01 --critic.epochs 3"
 
 CALIBRATED = {
     "monte-carlo-64": f"{_MONTE_CARLO} --num-envs 32 --horizon 64",
@@ -44,7 +41,7 @@ def _noisy(variants: dict[str, str]) -> dict[str, str]:
 
 def _preferences() -> dict[str, str]:
     return {
-        f"{metric.replace(':', '-')}-lambda-{lam}+noise": f"{_QUANTILE} --metric {metric} --lam {lam} {NOISE}"
+        f"{metric.replace(':', '-')}-lambda-{lam}+noise": f"dppo --metric {metric} --lam {lam} {NOISE}"
         for metric in ("mean", "cvar:0.25")
         for lam in (0.0, 0.5, 0.95, 1.0)
     }
