@@ -97,6 +97,14 @@ def test_the_coverage_of_critics_with_monte_carlo_targets_is_what_the_files_say(
         assert f"| `{run}` | {returns[run]:,.0f} | {100 * statistics['coverage_90']:.0f} % |" in text
 
 
+@pytest.mark.parametrize("study", ["ordered", "ordered-again"])
+def test_the_coverage_of_ordered_quantiles_is_what_the_file_says(study):
+    held = json.loads((ROOT / "results" / study / "calibration.json").read_text())
+    tasks = [[held.get(f"{task}-dppo-{seed}") for seed in range(5)] for task in ("ant", "hopper", "walker2d")]
+    cells = [" · ".join(f"{100 * found['coverage_90']:.0f}" for found in seeds if found) or "–" for seeds in tasks]
+    assert f"| `results/{study}` | {' | '.join(cells)} |" in (ROOT / "docs" / "decisions.md").read_text()
+
+
 def test_what_ordered_quantiles_cost_is_what_three_studies_say():
     studies = [results.read(ROOT / "results" / name) for name in ("tuned", "ordered", "ordered-again")]
     rows = [row for study in studies for row in study.rows if row.algo == "dppo" and row.task != "swimmer-v4"]
