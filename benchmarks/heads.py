@@ -2,7 +2,7 @@
 
     python benchmarks/heads.py --json benchmarks/results/heads.json
 
-Each is a setting of an algorithm, or a part that this file puts in the package's tables. Rows that the file has are not trained again.
+Each is a setting of DPPO or a part of it that this file puts in the package's tables. Rows that the file has are not trained again.
 """
 
 import dataclasses
@@ -40,8 +40,6 @@ class Arguments:
 
     critics: tuple[Name, ...] = get_args(Name)
     """Critics, of `MEASURED`."""
-    algos: tuple[str, ...] = ("dppo",)
-    """Algorithms with a value distribution."""
     tasks: tuple[str, ...] = ("hopper",)
     """Tasks."""
     seeds: tuple[int, ...] = (1001, 1002)
@@ -107,15 +105,15 @@ MEASURED: dict[str, dict] = {
 """Settings of the critic in which each departs from the preset."""
 
 
-def row(algo: str, task: str, critic: str, seed: int, total_steps: int) -> dict:
+def row(task: str, critic: str, seed: int, total_steps: int) -> dict:
     """Train and calibrate one."""
-    start = dg.preset("tuned", algo, task)
+    start = dg.preset("tuned", "dppo", task)
     fitted = dataclasses.replace(start.critic, **MEASURED[critic])
     config = resolve(dataclasses.replace(start, physics="native", seed=seed, total_steps=total_steps, critic=fitted))
     with TemporaryDirectory() as directory:
         run = dg.train(config, Path(directory) / "run", quiet=True)
         found = calibrate(Path(directory) / "run", config, which="newest")
-    about = {"algo": algo, "task": task, "critic": critic, "seed": seed, "total_steps": total_steps}
+    about = {"task": task, "critic": critic, "seed": seed, "total_steps": total_steps}
     return {**about, "return": run.evaluation["return_mean"], **found}
 
 
@@ -124,16 +122,16 @@ def main() -> None:
     arguments = parse(Arguments, "Critics whose quantiles cannot cross.")
     file = arguments.json
     rows = json.loads(file.read_text())["rows"] if file and file.exists() else []
-    known = {tuple(each[name] for name in ("algo", "task", "critic", "seed", "total_steps")): each for each in rows}
-    print(f"{'':32s}{'return':>8s}{'in 90 %':>9s}{'crossing':>10s}{'RMSE':>8s}{'spread':>8s}{'CRPS':>8s}")
-    for which in itertools.product(arguments.algos, arguments.tasks, arguments.critics, arguments.seeds, [arguments.total_steps]):
+    known = {(each["task"], each["critic"], each["seed"], each["total_steps"]): each for each in rows}
+    print(f"{'':26s}{'return':>8s}{'in 90 %':>9s}{'crossing':>10s}{'RMSE':>8s}{'spread':>8s}{'CRPS':>8s}")
+    for which in itertools.product(arguments.tasks, arguments.critics, arguments.seeds, [arguments.total_steps]):
         if which not in known:
             known[which] = row(*which)
             if file:
                 file.write_text(json.dumps({"machine": machine.facts(), "rows": list(known.values())}, indent=1) + "\n")
-        found, (algo, task, critic, seed, _) = known[which], which
+        found, (task, critic, seed, _) = known[which], which
         shares = f"{found['return']:8,.0f}{found['coverage_90']:9.0%}{found['crossing']:10.0%}"
-        print(f"{algo:6s}{task:9s}{critic:12s}{seed:5d}{shares}{found['rmse']:8.3f}{found['spread']:8.3f}{found['crps']:8.3f}", flush=True)
+        print(f"{task:9s}{critic:12s}{seed:5d}{shares}{found['rmse']:8.3f}{found['spread']:8.3f}{found['crps']:8.3f}", flush=True)
 
 
 if __name__ == "__main__":

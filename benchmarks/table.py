@@ -27,21 +27,21 @@ def table(found: dict) -> str:
 
 
 def critics(rows: list[dict]) -> str:
-    """A row per critic, algorithm and task; the seeds of each in their order, and means over them."""
+    """A row per critic and task; the seeds of each in their order, and means over them."""
     lines = [
-        "| critic | | seeds | returns | % in the central 90 % | crossing | RMSE | spread | CRPS |",
+        "| critic | task | seeds | returns | % in the central 90 % | crossing | RMSE | spread | CRPS |",
         "|---|---|---|---|---|---:|---:|---:|---:|",
     ]
     order = list(dict.fromkeys(row["critic"] for row in rows))
     kinds = defaultdict(list)
-    for row in sorted(rows, key=lambda row: (order.index(row["critic"]), row["algo"], row["task"], row["seed"])):
-        kinds[row["critic"], row["algo"], row["task"]].append(row)
-    for (critic, algo, task), group in kinds.items():
+    for row in sorted(rows, key=lambda row: (order.index(row["critic"]), row["task"], row["seed"])):
+        kinds[row["critic"], row["task"]].append(row)
+    for (critic, task), group in kinds.items():
         each = [(f"{row['seed']}", f"{row['return']:,.0f}", f"{100 * row['coverage_90']:.0f}") for row in group]
         seeds, returns, held = (" · ".join(numbers) for numbers in zip(*each, strict=True))
         crossing, *errors = (fmean(row[name] for row in group) for name in ("crossing", "rmse", "spread", "crps"))
         means = " | ".join([f"{100 * crossing:.0f} %", *(f"{error:.3f}" for error in errors)])
-        lines.append(f"| {critic} | {algo.upper()}, {task.capitalize()} | {seeds} | {returns} | {held} | {means} |")
+        lines.append(f"| {critic} | {task.capitalize()} | {seeds} | {returns} | {held} | {means} |")
     return "\n".join(lines)
 
 
