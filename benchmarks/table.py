@@ -2,7 +2,8 @@
 
 import json
 import sys
-from collections import defaultdict
+from itertools import groupby
+from operator import itemgetter
 from pathlib import Path
 from statistics import fmean
 
@@ -33,10 +34,9 @@ def critics(rows: list[dict]) -> str:
         "|---|---|---|---|---|---:|---:|---:|---:|",
     ]
     order = list(dict.fromkeys(row["critic"] for row in rows))
-    kinds = defaultdict(list)
-    for row in sorted(rows, key=lambda row: (order.index(row["critic"]), row["task"], row["seed"])):
-        kinds[row["critic"], row["task"]].append(row)
-    for (critic, task), group in kinds.items():
+    rows = sorted(rows, key=lambda row: (order.index(row["critic"]), row["task"], row["seed"]))
+    for (critic, task), members in groupby(rows, itemgetter("critic", "task")):
+        group = list(members)
         each = [(f"{row['seed']}", f"{row['return']:,.0f}", f"{100 * row['coverage_90']:.0f}") for row in group]
         seeds, returns, held = (" · ".join(numbers) for numbers in zip(*each, strict=True))
         crossing, *errors = (fmean(row[name] for row in group) for name in ("crossing", "rmse", "spread", "crps"))
