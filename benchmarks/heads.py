@@ -81,7 +81,7 @@ def head(obs_size: int, *, order: Callable = in_order, distance: Callable = quan
 
 
 OPTIONS, SHARP = CRITICS["quantile"].options, CRITICS["ordered"].options
-CRITICS["sorted"] = Part(partial(head, order=jnp.sort), OPTIONS)
+CRITICS["sorted-before"] = Part(partial(head, order=jnp.sort), OPTIONS)
 CRITICS["softplus"] = Part(head, OPTIONS)
 CRITICS["crps"] = Part(partial(head, distance=mean_crps), OPTIONS)
 CRITICS["scaled"] = Part(partial(head, order=jnp.asarray, distance=over_kappa), SHARP)
@@ -93,7 +93,7 @@ MEASURED: dict[str, dict] = {
     "quantile": {"kind": "quantile"},
     "plain": NARROW,
     "clipped": NARROW | {"max_grad_norm": 0.005},
-    "sorted": NARROW | {"kind": "sorted"},
+    "sorted": NARROW | {"kind": "sorted-before"},
     "softplus": NARROW | {"kind": "softplus"},
     "crps": NARROW | {"kind": "crps"},
     "lambda-0.99": NARROW | {"target": "lambda-0.99"},

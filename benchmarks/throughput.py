@@ -32,7 +32,7 @@ from turns import counted
 
 import dgae_jax as dg
 from dgae_jax.cli.arguments import parse
-from dgae_jax.configs.build import make_task, make_trainer, seed_keys
+from dgae_jax.configs.build import make_policy, make_task, make_trainer, seed_keys
 from dgae_jax.configs.config import Config, resolve
 from dgae_jax.learn import devices
 from dgae_jax.learn.iteration import _estimate, _roll_out, acting, nothing
@@ -196,7 +196,7 @@ def _without_physics(config: Config) -> list[tuple[Callable, tuple]]:
     pieces = taken_apart(dataclasses.replace(config, physics="native"), 1)
     state, _ = pieces.rollout[1]
     actor, env = Fitted(state.policy.params, state.observations), make_task(config)
-    act = acting(dg.make_algorithm(str(config.algo), env, config), actor)
+    act = acting(make_policy(env, config), actor)
     keys, obs = jax.random.split(jax.random.key(0), config.num_envs), state.episodes.env.obs
     draw = lambda: jax.lax.scan(lambda c, _: (c, act(keys, obs)[0]), 0, None, length=config.horizon)[1]  # noqa: E731
     return [(draw, ()), *pieces[1:]]

@@ -11,9 +11,10 @@ from typing import Literal
 import tyro
 
 from dgae_jax.cli.arguments import fail, parse
+from dgae_jax.cli.source import check_index, check_seed, config_of
 from dgae_jax.configs.config import Config, ConfigError, invalid, resolve
 from dgae_jax.configs.parts import is_distribution
-from dgae_jax.run import directory, files, terminal
+from dgae_jax.run import files, terminal
 from dgae_jax.run.options import RunOptions
 
 PURPOSE = "Compare the value distributions of critics with the returns that came."
@@ -21,7 +22,7 @@ PURPOSE = "Compare the value distributions of critics with the returns that came
 EXAMPLES = (
     "dgae calibrate runs/first",
     "dgae calibrate runs/first --checkpoint best --seed 1",
-    "dgae calibrate runs/narrow runs/wide --out calibration.png",
+    "dgae calibrate runs/first runs/first/refit.msgpack --out calibration.png",
 )
 
 
@@ -30,7 +31,7 @@ class Arguments:
     """Whose critics, and where the picture goes."""
 
     run_dirs: tyro.conf.Positional[tuple[Path, ...]]
-    """Directories of runs [paths]."""
+    """Directories of runs, or files of dgae refit and of policies [paths]."""
     checkpoint: Literal["newest", "best"] = "newest"
     """newest, or best: of the evaluations while it trained."""
     index: int = 0
@@ -39,7 +40,7 @@ class Arguments:
     """Seed of the episodes [1]."""
     out: Path | None = None
     """PNG with a histogram per run, and their statistics in a JSON file of the same name; by default calibration.png in the directory
-    of the first [path]."""
+    of the first, or beside its file, with its name in front [path]."""
     cache_dir: str = RunOptions.cache_dir
     """Where compiled programs are kept between runs; none disables [path]."""
 
@@ -63,15 +64,13 @@ def _checked(arguments: Arguments) -> dict[Path, Config]:
         raise ConfigError("RUN_DIRS: must be one run directory or more (--help lists every flag)")
     names = [path.resolve().name for path in arguments.run_dirs]
     if len(set(names)) < len(names):
-        raise ConfigError(f"RUN_DIRS {' '.join(names)}: must be directories of different names, by which their statistics are known")
-    runs = {path: resolve(directory.read_config(path)) for path in arguments.run_dirs}
+        raise ConfigError(f"RUN_DIRS {' '.join(names)}: must be of different names, by which their statistics are known")
+    runs = {path: resolve(config_of(path)) for path in arguments.run_dirs}
     for path, config in runs.items():
         if not is_distribution(str(config.critic.kind)):
             raise ConfigError(f"{path}: must be a run with a value distribution, not {config.algo}")
-        if not 0 <= arguments.index < config.num_seeds:
-            raise invalid("index", arguments.index, f"a whole number from 0 to {config.num_seeds - 1}, the index of a seed in {path}")
-    if not 0 <= arguments.seed < 2**31:
-        raise invalid("seed", arguments.seed, f"a whole number from 0 to {2**31 - 1:,} (an int32)")
+        check_index(arguments.index, config, path)
+    check_seed(arguments.seed)
     if arguments.out and not (arguments.out.suffix == ".png" and arguments.out.absolute().parent.is_dir()):
         raise invalid("out", arguments.out, "a file whose name ends in .png, in a directory that exists")
     return runs
@@ -93,7 +92,7 @@ def _calibrate(arguments: Arguments, runs: dict[Path, Config]) -> int:
             f"{path.resolve().name}: {100 * result['coverage_90']:.0f} % of the returns in the central 90 %, "
             f"{100 * result['crossing']:.0f} % of neighbours cross, rmse {result['rmse']:.3f}, spread {result['spread']:.3f}"
         )
-    out = arguments.out or arguments.run_dirs[0] / "calibration.png"
+    out = arguments.out or files.beside(arguments.run_dirs[0], "calibration.png")
     _write(out, lambda to: curve.save(picture.histograms(found), to))
     statistics = {name: result for name, (_, result) in found.items()}
     _write(out.with_suffix(".json"), lambda to: files.write_json(to, statistics))

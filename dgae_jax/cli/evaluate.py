@@ -12,7 +12,7 @@ from typing import Literal
 import tyro
 
 from dgae_jax.cli.arguments import fail, parse
-from dgae_jax.cli.source import config_of
+from dgae_jax.cli.source import check_file, check_seed, config_of
 from dgae_jax.configs.config import ConfigError, invalid
 from dgae_jax.run import files, terminal
 from dgae_jax.run.engines import engine_of
@@ -68,12 +68,9 @@ def _check(arguments: Arguments) -> None:
     (low, high, reason), out = WHOLE["episodes"], arguments.out
     if not low <= arguments.episodes <= high:
         raise invalid("episodes", arguments.episodes, f"a whole number from {low:,} to {high:,} ({reason})")
-    if not 0 <= arguments.seed < 2**31:
-        raise invalid("seed", arguments.seed, f"a whole number from 0 to {2**31 - 1:,} (an int32)")
-    if out and not out.absolute().parent.is_dir():
-        raise invalid("out", out, "a file in a directory that exists")
-    if out and (out.is_symlink() or (out.exists() and not out.is_file())):
-        raise invalid("out", out, "a file, not a directory, a link or a device")
+    check_seed(arguments.seed)
+    if out:
+        check_file(out)
 
 
 def _evaluate(arguments: Arguments) -> int:

@@ -12,11 +12,11 @@ from typing import Literal
 import tyro
 
 from dgae_jax.cli.arguments import fail, parse
-from dgae_jax.cli.source import config_of
+from dgae_jax.cli.source import check_index, config_of
 from dgae_jax.configs.config import Config, ConfigError, invalid, resolve
 from dgae_jax.envs.registry import spec_of
 from dgae_jax.export import graph
-from dgae_jax.run import terminal
+from dgae_jax.run import files, terminal
 from dgae_jax.run.options import RunOptions
 
 PURPOSE = "Take a trained policy and its critic out of a run, for programs without JAX."
@@ -67,12 +67,10 @@ def _checked(arguments: Arguments) -> tuple[Config, Path]:
     if "onnx" in arguments.to:
         graph.check_extra()
     config = resolve(config_of(arguments.run_dir))
-    if not 0 <= arguments.index < config.num_seeds:
-        allowed = f"a whole number from 0 to {config.num_seeds - 1}, the index of a seed in {arguments.run_dir}"
-        raise invalid("index", arguments.index, allowed)
+    check_index(arguments.index, config, arguments.run_dir)
     if "gymnasium" in arguments.to and spec_of(config.env).referee() is None:
         raise invalid("to", "gymnasium", f"left out with {config.env}, which Gymnasium does not play")
-    out = arguments.out or _default_out(arguments.run_dir)
+    out = arguments.out or files.beside(arguments.run_dir, "export")
     if not _can_be_written(out):
         raise invalid("out", out, "a directory that can be written")
     return config, out
@@ -85,10 +83,6 @@ def _can_be_written(out: Path) -> bool:
     except OSError:  # the name is too long, or lies behind a directory that may not be read
         return False
     return above.is_dir() and os.access(above, os.W_OK)
-
-
-def _default_out(source: Path) -> Path:
-    return source.with_name(f"{source.stem}-export") if source.is_file() else source / "export"
 
 
 def _export(arguments: Arguments, config: Config, out: Path) -> int:

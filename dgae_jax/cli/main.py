@@ -12,6 +12,7 @@ COMMANDS = {
     "train": "train a policy and write a run directory",
     "evaluate": "evaluate the policy of a run directory, or of a file",
     "calibrate": "compare the critic of run directories with the returns that came",
+    "refit": "fit a value distribution to a policy that is held fixed",
     "reproduce": "train all of a study: tasks, algorithms and seeds",
     "report": "figures, tables and one page from the results of studies",
     "tune": "search for the settings with the highest return",

@@ -12,10 +12,11 @@ from typing import Literal
 import tyro
 
 from dgae_jax.cli.arguments import fail, parse
+from dgae_jax.cli.source import config_of
 from dgae_jax.configs.config import Config, ConfigError, invalid, resolve
 from dgae_jax.envs.registry import TASKS, spec_of
 from dgae_jax.export import gl, video
-from dgae_jax.run import directory, terminal
+from dgae_jax.run import files, terminal
 from dgae_jax.run.options import RunOptions
 
 PURPOSE = "Make a film of the deterministic policy of a trained run, in Gymnasium."
@@ -32,7 +33,7 @@ class Arguments:
     """What to film, and how."""
 
     run_dir: tyro.conf.Positional[Path]
-    """Directory of the run [path]."""
+    """Directory of the run, or the file of dgae refit [path]."""
     compare: tuple[Path, ...] = ()
     """Further runs from the same initial states, shown beside it, from four on in a square [paths]."""
     checkpoint: Literal["newest", "best"] | None = None
@@ -105,6 +106,8 @@ def _check(arguments: Arguments) -> None:
     for other in ("compare", "checkpoint"):
         if arguments.during and getattr(arguments, other):
             raise invalid(other, getattr(arguments, other), "left out with --during, which shows every checkpoint of one run")
+    if arguments.during and arguments.run_dir.is_file():
+        raise ConfigError(f"--during: must be left out with {arguments.run_dir}, a single policy")
     if "mp4" in video.FORMATS[arguments.format]:
         video.check_extra()
 
@@ -121,7 +124,7 @@ def _check_out(arguments: Arguments) -> None:
 
 def _config(path: Path, index: int) -> Config:
     """The configuration of a run that Gymnasium can play."""
-    config = resolve(directory.read_config(path))
+    config = resolve(config_of(path))
     if not spec_of(config.env).referees:
         raise ConfigError(f"{path}: must be a run of {', '.join(TASKS)}, which can be filmed; it is one of {config.env}")
     if index >= config.num_seeds:
@@ -133,7 +136,7 @@ def _stem(arguments: Arguments) -> Path:
     """The file to write, without its ending."""
     if arguments.out is None:
         kinds = {"during": arguments.during, "compare": arguments.compare, "best": arguments.checkpoint == "best"}
-        return arguments.run_dir / "-".join(["film", *(kind for kind, is_so in kinds.items() if is_so)])
+        return files.beside(arguments.run_dir, "-".join(["film", *(kind for kind, is_so in kinds.items() if is_so)]))
     out = arguments.out
     return out.with_suffix("") if out.suffix in (".mp4", ".gif") else out
 

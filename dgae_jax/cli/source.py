@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from dgae_jax.configs.config import Config
+from dgae_jax.configs.config import Config, invalid
 from dgae_jax.run import directory
 
 
@@ -13,3 +13,23 @@ def config_of(source: Path) -> Config:
     from dgae_jax.run import restore
 
     return restore.config_of(source)
+
+
+def check_index(index: int, config: Config, source: Path) -> None:
+    """Raise ConfigError unless so many seeds were trained side by side."""
+    if not 0 <= index < config.num_seeds:
+        raise invalid("index", index, f"a whole number from 0 to {config.num_seeds - 1}, the index of a seed in {source}")
+
+
+def check_seed(seed: int) -> None:
+    """Raise ConfigError unless the seed of episodes is one."""
+    if not 0 <= seed < 2**31:
+        raise invalid("seed", seed, f"a whole number from 0 to {2**31 - 1:,} (an int32)")
+
+
+def check_file(out: Path) -> None:
+    """Raise ConfigError unless a file can be written there, as far as can be seen."""
+    if not out.absolute().parent.is_dir():
+        raise invalid("out", out, "a file in a directory that exists")
+    if out.is_symlink() or (out.exists() and not out.is_file()):
+        raise invalid("out", out, "a file, not a directory, a link or a device")

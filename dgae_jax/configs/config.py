@@ -100,7 +100,8 @@ class CriticConfig(FitConfig):
     """The value network and what it is fitted to."""
 
     kind: str | None = None
-    """scalar (one value), quantile (a distribution) or ordered (one whose quantiles do not cross); unset: the algorithm's own."""
+    """scalar (one value), quantile (a distribution), sorted (the same without crossings) or ordered (another without); unset: the
+    algorithm's own."""
     target: str | None = None
     """bellman, bellman-frozen, lambda-shift, sr-lambda, lambda-return or monte-carlo; unset: the algorithm's own."""
     quantiles: int | None = None

@@ -40,6 +40,7 @@ UPDATES = {
 CRITICS = {
     "scalar": Part("dgae_jax.learn.critics:scalar"),
     "quantile": Part("dgae_jax.learn.critics:quantile", {"quantiles": 64, "kappa": 1.0}),
+    "sorted": Part("dgae_jax.learn.critics:sorted_quantile", {"quantiles": 64, "kappa": 1.0}),
     "ordered": Part("dgae_jax.learn.critics:ordered", {"quantiles": 64, "kappa": 1e-4}),
 }
 """What a critic predicts: `build(obs_size, hidden=, target=, **options) -> Critic`."""

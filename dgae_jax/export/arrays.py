@@ -2,9 +2,9 @@
 
 `policy_weight_I` [inputs, outputs] and `policy_bias_I` are the layers from the first to the last, likewise the critic's; tanh stands
 between layers. Where there is `critic_steps` [K - 1, K], the critic's first output is the mean of its quantiles, to which
-log(1 + exp(the others)) @ `critic_steps` is added. Observations are normalised before: (obs - `observation_mean`) / `observation_std`,
-clipped to ± `observation_limit`. Actions are clipped to `action_low` … `action_high`. `env` is Gymnasium's name of the task,
-`episode_length` its time limit.
+log(1 + exp(the others)) @ `critic_steps` is added; where there is `critic_count` [1], its quantiles are its K outputs, sorted.
+Observations are normalised before: (obs - `observation_mean`) / `observation_std`, clipped to ± `observation_limit`. Actions are
+clipped to `action_low` … `action_high`. `env` is Gymnasium's name of the task, `episode_length` its time limit.
 """
 
 import io
@@ -41,6 +41,8 @@ def arrays_of(found: Trained, config: Config, index: int) -> Arrays:
         layers = {**_layers("policy", policy.params), **_layers("critic", critic.params)}
         if config.critic.kind == "ordered":
             layers |= _in_order(layers)
+        elif config.critic.kind == "sorted":
+            layers["critic_count"] = np.array([config.critic.quantiles])
     except KeyError as name:
         raise _foreign(found, f"{name} is missing") from name
     arrays = {

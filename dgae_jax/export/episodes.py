@@ -16,9 +16,9 @@ from dgae_jax.maths.risk import weights_of
 from dgae_jax.maths.transport import directional_metric
 from dgae_jax.run import restore
 from dgae_jax.run.api import Policy
-from dgae_jax.run.calibration import LONGEST, steps_that_count
 from dgae_jax.run.engines import referee
 from dgae_jax.run.evaluation import episode_seeds
+from dgae_jax.run.outcomes import LONGEST, steps_that_count
 
 
 class Actor(NamedTuple):

@@ -25,6 +25,8 @@ def model(arrays: dict[str, np.ndarray], about: Mapping[str, str]) -> bytes:
 
     limit = arrays["observation_limit"]
     constants = {name: x for name, x in arrays.items() if x.dtype == np.float32} | {"observation_lowest": -limit}
+    if "critic_count" in arrays:
+        constants["critic_count"] = arrays["critic_count"]
     if "critic_steps" in arrays:
         constants["critic_parts"] = np.array([1, len(arrays["critic_steps"])])
     nodes = [
@@ -68,9 +70,12 @@ def _network(network: str, arrays: dict[str, np.ndarray], output: str) -> list[A
 
 
 def _critic(arrays: dict[str, np.ndarray]) -> list[Any]:
-    """Its network, whose mean and steps are made quantiles where it gives these."""
+    """Its network, whose mean and steps are made quantiles where it gives these, and whose outputs are sorted where they may cross."""
     from onnx import helper
 
+    if "critic_count" in arrays:
+        lowest = helper.make_node("TopK", ["outputs", "critic_count"], ["quantiles", "ranks"], axis=-1, largest=0)
+        return [*_network("critic", arrays, "outputs"), lowest]
     if "critic_steps" not in arrays:
         return _network("critic", arrays, "quantiles")
     return [

@@ -10,7 +10,7 @@ from dgae_jax.envs.base import Env
 from dgae_jax.learn import devices, normalizers
 from dgae_jax.learn.diagnostics import Diagnose, nothing
 from dgae_jax.learn.rollout import Act, Episodes, rollout, start
-from dgae_jax.learn.types import Algorithm, Batch, Fit, Fitted, TrainState, Transition
+from dgae_jax.learn.types import Algorithm, Batch, Fit, Fitted, Policy, TrainState, Transition
 from dgae_jax.maths import gaussian
 from dgae_jax.maths.returns import decay, lambda_return, lambda_sum
 from dgae_jax.maths.statistics import explained_variance
@@ -96,18 +96,18 @@ def _roll_out(
     """Every device rolls out its own worlds; what they saw is known to all."""
 
     def share(actor: Fitted, episodes: Episodes, keys: Key[Array, "T n"]) -> tuple[Episodes, Transition]:
-        return rollout(env, acting(algorithm, actor), episodes, keys, episode_length=episode_length)
+        return rollout(env, acting(algorithm.policy, actor), episodes, keys, episode_length=episode_length)
 
     actor = Fitted(state.policy.params, state.observations)
     episodes, step = devices.divided(share, (None, 0, 1), (0, 1))(actor, state.episodes, keys)
     return episodes, devices.gather(step)
 
 
-def acting(algorithm: Algorithm, actor: Fitted) -> Act:
+def acting(policy: Policy, actor: Fitted) -> Act:
     """Actions drawn from the policy, and their log-probabilities."""
 
     def act(keys: Array, obs: Array) -> tuple[Array, Array]:
-        distribution = algorithm.policy.apply(actor.params, normalizers.normalize(actor.observations, obs))
+        distribution = policy.apply(actor.params, normalizers.normalize(actor.observations, obs))
         action = jax.vmap(gaussian.sample)(keys, distribution)
         return action, gaussian.log_prob(distribution, action)
 

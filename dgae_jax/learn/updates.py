@@ -1,6 +1,7 @@
 """Updates of parameters: the surrogate objective, stochastic gradient steps on any loss, and the trust region."""
 
 from collections.abc import Callable
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -11,7 +12,7 @@ from dgae_jax.learn import devices
 from dgae_jax.learn.types import Batch, Fit, Params, Policy, Update
 from dgae_jax.maths import gaussian
 
-Loss = Callable[[Params, Batch], tuple[jax.Array, dict[str, jax.Array]]]
+Loss = Callable[[Params, Any], tuple[jax.Array, dict[str, jax.Array]]]
 """`loss(params, batch) -> (scalar, info)`; info holds scalars worth logging."""
 
 
@@ -50,18 +51,18 @@ def surrogate(policy: Policy, clip: ArrayLike = jnp.inf) -> Loss:
 
 
 def sgd(loss: Loss, optimizer: optax.GradientTransformation, *, epochs: int, minibatches: int) -> Update:
-    """`epochs` passes over the shuffled batch in `minibatches` optimizer steps each.
+    """`epochs` passes over the shuffled batch, any record of arrays [B, …] with `obs`, in `minibatches` optimizer steps each.
 
     A2C, PPO's policy step and every critic fit are this. The info holds the means over all steps.
     """
 
-    def minibatch(fit: Fit, batch: Batch):
+    def minibatch(fit: Fit, batch: Any):
         (value, info), gradient = jax.value_and_grad(loss, has_aux=True)(fit.params, batch)
         updates, opt_state = optimizer.update(gradient, fit.opt_state, fit.params)
         info = {"loss": value, "gradient_norm": optax.global_norm(gradient), **info}
         return Fit(optax.apply_updates(fit.params, updates), opt_state), info
 
-    def step(key: jax.Array, fit: Fit, batch: Batch):
+    def step(key: jax.Array, fit: Fit, batch: Any):
         size = batch.obs.shape[0]
         if size % minibatches:
             raise ValueError(f"a batch of {size} samples does not divide into {minibatches} minibatches")

@@ -7,26 +7,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from dgae_jax.configs.build import make_algorithm, make_task
-from dgae_jax.configs.config import Config, invalid
-from dgae_jax.learn import normalizers
+from dgae_jax.configs.build import make_quantiles, make_task
+from dgae_jax.configs.config import Config
 from dgae_jax.learn.diagnostics import SIMILAR, similar_means
-from dgae_jax.learn.iteration import acting
-from dgae_jax.learn.rollout import Episodes, rollout, start
-from dgae_jax.learn.types import Fitted, Transition
-from dgae_jax.maths.returns import bellman_target, lambda_sum
+from dgae_jax.maths.returns import bellman_target
 from dgae_jax.maths.statistics import coverage, crps, pit
-from dgae_jax.run import restore
-from dgae_jax.run.compiling import Watch, compile_aside, unwatched
+from dgae_jax.run import outcomes, restore
+from dgae_jax.run.compiling import Watch, unwatched
 
-WORLDS, CHUNK = 64, 100
-"""Worlds side by side, and steps between looks at signals and clock."""
-
-LEFT_OUT = 0.01
-"""Weight γᵏ of the first reward that the return from a state leaves out, unless the episode ends before."""
-
-LONGEST = 50_000
-"""Most steps that a return is followed for."""
+WORLDS = 64
+"""Worlds side by side."""
 
 SHARES = (SIMILAR, 0.03, 0.01, 0.003)
 """Of W₁, up to which |d| counts as that of similar means."""
@@ -35,51 +25,24 @@ BINS = 20
 """Of the histogram of the probability integral transform."""
 
 
-def steps_that_count(gamma: float) -> int:
-    """How many rewards of a return have a weight γᵏ above `LEFT_OUT`, at most `LONGEST`."""
-    return int(np.count_nonzero(gamma ** np.arange(LONGEST) > LEFT_OUT))
+def calibrate(source: Path, config: Config, *, which: str, index: int = 0, seed: int = 0, watch: Watch = unwatched) -> dict[str, Any]:
+    """Statistics of the critic of a run, or in a file, over the `outcomes` of `WORLDS` worlds, actions drawn from the policy.
 
-
-def calibrate(run_dir: Path, config: Config, *, which: str, index: int = 0, seed: int = 0, watch: Watch = unwatched) -> dict[str, Any]:
-    """Statistics of a run's critic over `episode_length` steps in each of `WORLDS` worlds, actions drawn from the policy.
-
-    Returns are of scaled rewards, as the critic's, followed until γᵏ < `LEFT_OUT` without a time limit: `coverage_90` is the share
+    Returns are of scaled rewards, as the critic's: `coverage_90` is the share
     of them inside the central 90 % of the quantiles, `crossing` the share of neighbouring quantiles in the wrong order, `bias` and
     `rmse` those of the mean, `spread` the mean standard deviation of the quantiles, `crps` the continuous ranked probability score,
     `pit` the share of returns in each of `BINS` equal parts of probability, `similar_means` the shares of steps whose target and
-    prediction have similar means for their shapes (`similar`). Raises ConfigError where γ is too near 1 for returns to
-    be followed, and as `restore.trained`.
+    prediction have similar means for their shapes (`similar`). Raises as `outcomes.play`, `restore.trained` and `restore.reward_std`.
     """
-    if (tail := steps_that_count(config.gamma)) == LONGEST:
-        raise invalid("gamma", config.gamma, f"at most {LEFT_OUT ** (1 / LONGEST):.4f}, so that returns can be followed to their end")
-    found = restore.trained(run_dir, config, which)
+    outcomes.check_horizon(config)
+    found = restore.trained(source, config, which)
     policy, critic = jax.tree.map(lambda x: x[index], (found.policy, found.critic))
     std = float(restore.reward_std(found.path, config)[index])
-    env = make_task(config)
-    algorithm = make_algorithm(str(config.algo), env, config)
-
-    @jax.jit
-    @jax.default_matmul_precision("highest")  # as in training
-    def go_on(policy: Fitted, critic: Fitted, worlds: Episodes, keys: jax.Array) -> tuple[Episodes, Transition, jax.Array]:
-        worlds, step = rollout(env, acting(algorithm, policy), worlds, keys, episode_length=2**30)
-        return worlds, step, algorithm.critic.predict(critic.params, normalizers.normalize(critic.observations, step.obs))
-
-    begin, draw = jax.random.split(jax.random.key(seed))
-    worlds, parts = jax.jit(lambda keys: start(env, keys))(jax.random.split(begin, WORLDS)), []
-    length = -(-(config.episode_length + tail) // CHUNK)
-    keys = jax.random.split(draw, (length, CHUNK, WORLDS))
-    compile_aside(go_on, policy, critic, worlds, keys[0], watch=watch, what="compiling")
-    for i in range(length):
-        watch(f"playing step {i * CHUNK:,} of {length * CHUNK:,} in {WORLDS} worlds")
-        worlds, step, quantiles = go_on(policy, critic, worlds, keys[i])
-        kept = i * CHUNK < config.episode_length
-        parts.append((step.reward / std, config.gamma * (1.0 - step.terminated), quantiles if kept else None))
-    rewards, discounts, predicted = zip(*parts, strict=True)
-    quantiles = jnp.concatenate([each for each in predicted if each is not None])
-    reward, discount = jnp.concatenate(rewards), jnp.concatenate(discounts)
-    outcome = lambda_sum(reward, discount)[: len(quantiles)]
-    about = {"checkpoint": found.path.name, "samples": outcome.size}
-    return {**about, **statistics(quantiles, outcome), "similar_means": similar(reward, discount, quantiles)}
+    came = outcomes.play(policy, config, jax.random.key(seed), WORLDS, watch)
+    quantiles = jax.jit(make_quantiles(make_task(config), config))(critic, came.obs)
+    about = {"checkpoint": found.path.name, "samples": came.outcome.size}
+    similar_means = similar(came.reward / std, came.discount, quantiles)
+    return {**about, **statistics(quantiles, came.outcome / std), "similar_means": similar_means}
 
 
 def statistics(quantiles: jax.Array, outcome: jax.Array) -> dict[str, Any]:

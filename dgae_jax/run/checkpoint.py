@@ -38,6 +38,10 @@ class DamagedError(CheckpointError):
     """A checkpoint whose bytes are not what was written; an older one may be whole."""
 
 
+class MissingError(CheckpointError):
+    """A file without an array that is looked for."""
+
+
 class NotFiniteError(CheckpointError):
     """A state that must not be saved, continued or evaluated: a number in it is NaN or infinite."""
 
@@ -118,14 +122,15 @@ def load(path: Path, like: T, *, part: bool = False) -> T:
     """The tree of arrays saved at `path`, in which each is as `like` says (anything with shape and dtype).
 
     With `part` the file may hold more than `like`. Raises DamagedError if the file cannot be read whole, CheckpointError if
-    an array is missing, unknown or of another type or shape, which is seen before it is decoded, NotFiniteError if it holds
+    an array is missing (MissingError), unknown or of another type or shape, which is seen before it is decoded, NotFiniteError if it
+    holds
     NaN or infinity where `not_finite` says that it must not.
     """
     want = jax.eval_shape(_plain, like)
     with _body(path) as (file, size):
         got = dict(_arrays(path, file, size, want, part))
     for name in sorted(set(want) - set(got)):
-        raise CheckpointError(f"{path}: is of another run, {name} is missing")
+        raise MissingError(f"{path}: is of another run, {name} is missing")
     for name in not_finite(got):
         raise NotFiniteError(f"{path}: {name} is not finite: it can be neither continued nor evaluated")
 

@@ -17,7 +17,7 @@ from dgae_jax.envs.registry import GIVEN, spec_of
 from dgae_jax.learn import play
 from dgae_jax.learn.parallel import Trainer
 from dgae_jax.learn.types import Fitted
-from dgae_jax.run import restore
+from dgae_jax.run import files, restore
 from dgae_jax.run.compiling import Watch, compile_aside, unwatched
 from dgae_jax.run.engines import engine_of, referee
 from dgae_jax.run.summary import counted, over_seeds, summary
@@ -54,8 +54,7 @@ def make_referee(config: Config) -> Any:
 
 def default_path(source: Path, engine: str, which: str) -> Path:
     """The file of an evaluation after training, one for each engine and choice of checkpoint; beside a policy's own file."""
-    name = f"evaluation-{engine}{'' if which == 'newest' else f'-{which}'}.json"
-    return source.with_name(f"{source.stem}-{name}") if source.is_file() else source / name
+    return files.beside(source, f"evaluation-{engine}{'' if which == 'newest' else f'-{which}'}.json")
 
 
 def episode_seeds(seed: int, episodes: int) -> np.ndarray:

@@ -26,6 +26,11 @@ def replace(path: Path, data: bytes) -> None:
             part.unlink(missing_ok=True)
 
 
+def beside(source: Path, name: str) -> Path:
+    """Where what was made of a run is written: in its directory, or beside the file of a policy, with its name in front."""
+    return source.with_name(f"{source.stem}-{name}") if source.is_file() else source / name
+
+
 def sync_directory(path: Path) -> None:
     """The names in a directory are on the disk when this returns; a rename alone may be lost with the power."""
     descriptor = os.open(path, os.O_RDONLY)

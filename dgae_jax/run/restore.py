@@ -8,13 +8,14 @@ from typing import Any, NamedTuple, TypeVar
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import ArrayLike
 
 from dgae_jax.configs.build import make_task, make_trainer, seed_keys
 from dgae_jax.configs.config import Config, invalid
 from dgae_jax.configs.serial import MAY_CHANGE, differences
 from dgae_jax.learn.types import Fitted, TrainState
 from dgae_jax.run import checkpoint, directory, terminal
-from dgae_jax.run.checkpoint import CheckpointError, DamagedError
+from dgae_jax.run.checkpoint import CheckpointError, DamagedError, MissingError
 from dgae_jax.run.evaluations import EvaluationsFile
 
 T = TypeVar("T")
@@ -80,11 +81,17 @@ def kept(run_dir: Path, config: Config) -> Iterator[Trained]:
 
 
 def reward_std(path: Path, config: Config) -> np.ndarray:
-    """What the rewards of every run [S] were last divided by in the checkpoint at `path`; 1 without `normalize_rewards`."""
+    """What the rewards of every run [S] were last divided by in the checkpoint at `path`; 1 without `normalize_rewards`.
+
+    Raises CheckpointError for a file that does not say, as those of policies once did not.
+    """
     if not config.normalize_rewards:
         return np.ones(config.num_seeds)
-    part = {"reward_scale": {"returns": {"std": _blank(config).reward_scale.returns.std}}}
-    return np.asarray(checkpoint.load(path, part, part=True)["reward_scale"]["returns"]["std"])
+    part = _scale(_blank(config).reward_scale.returns.std)
+    try:
+        return np.asarray(checkpoint.load(path, part, part=True)["reward_scale"]["returns"]["std"])
+    except MissingError:
+        raise CheckpointError(f"{path}: does not say what rewards were divided by; dgae refit fits a critic that does") from None
 
 
 def load_state(path: Path, config: Config) -> TrainState:
@@ -106,15 +113,21 @@ def in_new_episodes(state: TrainState, config: Config) -> TrainState:
     return state._replace(episodes=episodes, reward_scale=scale)
 
 
-def save_networks(path: Path, config: Config, networks: Trained) -> None:
-    """What acting and predicting takes as a file of its own, which `trained` reads."""
+def save_networks(path: Path, config: Config, networks: Trained, std: ArrayLike) -> None:
+    """What acting and predicting takes as a file of its own, which `trained` and `reward_std` read; `std` as from the latter."""
     (policy, critic), stats = (networks.policy, networks.critic), networks.policy.observations
-    checkpoint.write(path, config, checkpoint.arrays_of(_networks(policy.params, critic.params, stats)))
+    scale = _scale(jnp.asarray(std, jnp.float32)) if config.normalize_rewards else {}
+    checkpoint.write(path, config, checkpoint.arrays_of(_networks(policy.params, critic.params, stats) | scale))
 
 
 def _networks(policy: Any, critic: Any, observations: Any) -> dict[str, Any]:
     """As they are named in a training state."""
     return {"policy": {"params": policy}, "critic": {"params": critic}, "observations": observations}
+
+
+def _scale(std: Any) -> dict[str, Any]:
+    """As it is named in a training state."""
+    return {"reward_scale": {"returns": {"std": std}}}
 
 
 def _load_networks(path: Path, config: Config) -> Trained:

@@ -113,4 +113,5 @@ def _keep_policy(run_dir: Path, config: Config, path: Path) -> None:
     if not path.is_file() or path.stat().st_mtime < (run_dir / "evaluation.json").stat().st_mtime:
         from dgae_jax.run import restore
 
-        restore.save_networks(path, config, restore.trained(run_dir, config, "newest"))
+        found = restore.trained(run_dir, config, "newest")
+        restore.save_networks(path, config, found, restore.reward_std(found.path, config))

@@ -62,7 +62,8 @@ def test_a_policys_file_is_exported_beside_it_and_again_over_it(run_dir, run, tm
     config = read_config(run_dir)
     file = tmp_path / "policies" / "hopper.msgpack"
     file.parent.mkdir()
-    restore.save_networks(file, config, restore.trained(run_dir, config, "newest"))
+    found = restore.trained(run_dir, config, "newest")
+    restore.save_networks(file, config, found, restore.reward_std(found.path, config))
     for _ in range(2):
         code, out, err = run(file, "--to", "npz", "npz")
         where = tmp_path / "policies" / "hopper-export" / "npz"

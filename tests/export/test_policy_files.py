@@ -26,7 +26,7 @@ from dgae_jax.run.loop import train
 from tests.helpers import ROOT
 from tests.runs import QUIET, last, small
 
-LOUD = {"quantile": 100, "scalar": 30, "ordered": 100}
+LOUD = {"quantile": 100, "scalar": 30, "ordered": 100, "sorted": 100}
 """The last layer of a small run's policy is small; so many times larger its actions reach the actuators' range."""
 
 
@@ -40,19 +40,20 @@ def state_covariance(config):
     return dataclasses.replace(config, policy=policy, normalize_observations=False, normalize_rewards=False)
 
 
-def in_order(config):
-    return dataclasses.replace(config, critic=dataclasses.replace(config.critic, kind="ordered", kappa=1e-4))
+def of_kind(config, kind):
+    return resolve(dataclasses.replace(config, critic=dataclasses.replace(config.critic, kind=kind, kappa=None)))
 
 
 CONFIGS = {
     "quantile": shaped(small("dppo"), (8, 6)),
-    "ordered": in_order(shaped(small("dppo"), (8, 6))),
+    "ordered": of_kind(shaped(small("dppo"), (8, 6)), "ordered"),
+    "sorted": of_kind(shaped(small("dppo"), (8, 6)), "sorted"),
     "scalar": state_covariance(small("trpo", seeds=2)),
 }
 """Between them all critics, both covariances, one and two hidden layers, with and without normaliser, one seed and two."""
 
-KINDS = {"quantile": 8, "scalar": 1, "ordered": 8}
-INDEX = {"quantile": 0, "scalar": 1, "ordered": 0}
+KINDS = {"quantile": 8, "scalar": 1, "ordered": 8, "sorted": 8}
+INDEX = {"quantile": 0, "scalar": 1, "ordered": 0, "sorted": 0}
 
 
 @pytest.fixture(scope="module")
@@ -72,7 +73,8 @@ def exported(request, runs, tmp_path_factory):
     head = found.policy.params["params"]["Dense_0"]
     params = {"params": {**found.policy.params["params"], "Dense_0": {**head, "kernel": LOUD[name] * head["kernel"]}}}
     file = directory / "loud.msgpack"
-    restore.save_networks(file, config, found._replace(policy=found.policy._replace(params=params)))
+    loud = found._replace(policy=found.policy._replace(params=params))
+    restore.save_networks(file, config, loud, restore.reward_std(found.path, config))
     bundle.export(file, config, "newest", index, tuple(bundle.FILES), directory)
     statistics = found.policy.observations
     mean, std = (0, 1) if statistics is None else (np.asarray(statistics.mean[index]), np.asarray(statistics.std[index]))

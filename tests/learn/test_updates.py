@@ -214,6 +214,16 @@ def test_ordered_quantiles_are_fitted_in_the_mean_as_a_scalar_and_in_shape_by_th
     assert_allclose(got[1:], by_output(shape)[1:], rtol=1e-3, atol=1e-6)
 
 
+def test_a_sorted_critic_is_fitted_as_a_quantile_critic_and_predicts_the_same_in_order(batch, key):
+    settings = {"hidden": (4,), "target": critics.BELLMAN, "quantiles": 8, "kappa": 1.0}
+    plain, in_order = critics.quantile(3, **settings), critics.sorted_quantile(3, **settings)
+    params = plain.init(key)
+    predicted = plain.predict(params, batch.obs)
+    assert (jnp.diff(predicted) < 0).any()
+    assert_array_equal(in_order.predict(params, batch.obs), jnp.sort(predicted))
+    assert in_order.loss(params, batch)[0] == plain.loss(params, batch)[0]
+
+
 # ---- policy networks ----
 
 

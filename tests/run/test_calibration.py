@@ -9,7 +9,7 @@ import pytest
 
 from dgae_jax.cli import calibrate
 from dgae_jax.maths.transport import quantile_midpoints
-from dgae_jax.run import calibration, directory, loop
+from dgae_jax.run import calibration, directory, loop, outcomes
 from tests import helpers, runs
 
 UNIFORM = jnp.tile(quantile_midpoints(100), (1000, 1, 1))
@@ -64,9 +64,10 @@ def test_what_cannot_be_compared_is_refused_in_one_line(changes, message, tmp_pa
     assert message in capsys.readouterr().err
 
 
-def test_the_critics_of_both_kinds_of_quantiles_can_be_compared(tmp_path):
+def test_the_critics_of_all_kinds_of_quantiles_can_be_compared(tmp_path):
     plain = runs.small("dppo")
-    made = {"quantile": plain, "ordered": dataclasses.replace(plain, critic=dataclasses.replace(plain.critic, kind="ordered"))}
+    kinds = ("quantile", "sorted", "ordered")
+    made = {kind: dataclasses.replace(plain, critic=dataclasses.replace(plain.critic, kind=kind)) for kind in kinds}
     for name, config in made.items():
         directory.create(tmp_path / name, config, runs.QUIET)
     checked = calibrate._checked(calibrate.Arguments(tuple(tmp_path / name for name in made)))
@@ -79,7 +80,7 @@ def test_runs_of_the_same_name_are_refused(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr("sys.argv", ["dgae calibrate", *(str(tmp_path / parent / "run") for parent in ("a", "b"))])
     with pytest.raises(SystemExit, match="2"):
         helpers.command("calibrate")()
-    assert "RUN_DIRS run run: must be directories of different names" in capsys.readouterr().err
+    assert "RUN_DIRS run run: must be of different names" in capsys.readouterr().err
 
 
 @pytest.mark.slow  # a program of its own is compiled
@@ -88,7 +89,7 @@ def test_the_command_writes_the_statistics_of_every_run_and_a_picture(tmp_path, 
     monkeypatch.setattr("sys.argv", ["dgae calibrate", str(tmp_path / "run"), "--cache-dir", runs.QUIET.cache_dir])
     assert helpers.command("calibrate")() == 0
     found = json.loads((tmp_path / "run" / "calibration.json").read_text())["run"]
-    assert found["samples"] == calibration.WORLDS * calibration.CHUNK  # episodes of 20 steps, in whole chunks
+    assert found["samples"] == calibration.WORLDS * outcomes.CHUNK  # episodes of 20 steps, in whole chunks
     assert np.isfinite([*found["pit"], found["rmse"], found["crps"], *found["similar_means"].values()]).all()
     assert (tmp_path / "run" / "calibration.png").read_bytes().startswith(b"\x89PNG")
     assert "of the returns in the central 90 %" in capsys.readouterr().out

@@ -19,6 +19,8 @@ class Policy:
     def quantiles(self, obs: Any) -> np.ndarray:
         """The critic's quantiles [..., K] of the discounted return, K = 1 for a scalar critic, in the units it was trained in."""
         outputs = self._outputs("critic", obs)
+        if "critic_count" in self.arrays:
+            return np.sort(outputs)
         if "critic_steps" not in self.arrays:
             return outputs
         return outputs[..., :1] + np.logaddexp(np.float32(0), outputs[..., 1:]) @ self.arrays["critic_steps"]

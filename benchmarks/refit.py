@@ -1,0 +1,71 @@
+"""How many returns a value distribution holds that is fitted to a finished policy, and where in it they fall.
+
+    python benchmarks/refit.py --json benchmarks/results/refit.json --picture docs/images/calibration-refit.png
+
+The policies are those of the table of results, which keep what they return. Rows that the file has are not fitted again.
+"""
+
+import itertools
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+from dgae_jax.cli.arguments import parse
+from dgae_jax.report import calibration as picture
+from dgae_jax.report.results import Row, read
+from dgae_jax.run import curve, machine, restore
+from dgae_jax.run.calibration import calibrate
+from dgae_jax.run.refit import refit
+
+
+@dataclass(frozen=True)
+class Arguments:
+    """Whose returns are fitted."""
+
+    study: Path = Path("results/tuned")
+    """Study with the policies [path]."""
+    algos: tuple[str, ...] = ("dppo",)
+    """Algorithms."""
+    tasks: tuple[str, ...] = ("ant", "hopper", "walker2d")
+    """Tasks."""
+    seeds: tuple[int, ...] = (0, 1, 2, 3, 4)
+    """Seeds."""
+    json: Path | None = None
+    """File to keep the numbers in [path]."""
+    picture: Path | None = None
+    """PNG with a histogram for each [path]."""
+
+
+def row(study: Path, cell: Row) -> dict:
+    """Fit and calibrate one, in other episodes than those it was fitted to."""
+    source = study / "policies" / f"{cell.cell}.msgpack"
+    with TemporaryDirectory() as directory:
+        made, file = refit(source, restore.config_of(source), which="newest"), Path(directory) / source.name
+        restore.save_networks(file, made.config, made.networks, made.std)
+        found = calibrate(file, made.config, which="newest")
+    about = {"task": cell.env, "critic": f"refit to {cell.algo.upper()}", "seed": cell.seed, "return": cell.final}
+    return {**about, **found}
+
+
+def main() -> None:
+    """Print a line for each policy."""
+    arguments = parse(Arguments, "Value distributions that are fitted to finished policies.")
+    file, known = arguments.json, {}
+    if file and file.exists():
+        known = {each["checkpoint"]: each for each in json.loads(file.read_text())["rows"]}
+    cells = {f"{cell.cell}.msgpack": cell for cell in read(arguments.study).rows}
+    for which in itertools.product(arguments.tasks, arguments.algos, arguments.seeds):
+        name = "-".join(map(str, which)) + ".msgpack"
+        if name not in known:
+            known[name] = row(arguments.study, cells[name])
+            if file:
+                file.write_text(json.dumps({"machine": machine.facts(), "rows": list(known.values())}, indent=1) + "\n")
+        print(f"{name:28s}{known[name]['coverage_90']:6.1%} in 90 %, CRPS {known[name]['crps']:.3f}", flush=True)
+    if arguments.picture:
+        shown = {name.removesuffix(".msgpack"): (name.split("-")[1], each) for name, each in known.items()}
+        curve.save(picture.histograms(shown), arguments.picture)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,75 @@
+"""The returns that came: episodes of the policy as it acts while training, each followed until further rewards do not count."""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Key
+
+from dgae_jax.configs.build import make_policy, make_task
+from dgae_jax.configs.config import Config, invalid
+from dgae_jax.learn.iteration import acting
+from dgae_jax.learn.rollout import Episodes, rollout, start
+from dgae_jax.learn.types import Fitted, Transition
+from dgae_jax.maths.returns import lambda_sum
+from dgae_jax.run.compiling import Watch, compile_aside, unwatched
+
+CHUNK = 100
+"""Steps between looks at signals and clock."""
+
+LEFT_OUT = 0.01
+"""Weight γᵏ of the first reward that the return from a state leaves out, unless the episode ends before."""
+
+LONGEST = 50_000
+"""Most steps that a return is followed for."""
+
+
+class Outcomes(NamedTuple):
+    """What N worlds showed of a policy in T steps; the episodes in them have no time limit."""
+
+    obs: Float[Array, "T N O"]
+    reward: Float[Array, "T N"]
+    discount: Float[Array, "T N"]
+    """γ, and 0 where the episode ended."""
+    outcome: Float[Array, "T N"]
+    """The discounted return from each state on, of rewards as they are."""
+
+
+def steps_that_count(gamma: float) -> int:
+    """How many rewards of a return have a weight γᵏ above `LEFT_OUT`, at most `LONGEST`."""
+    return int(np.count_nonzero(gamma ** np.arange(LONGEST) > LEFT_OUT))
+
+
+def check_horizon(config: Config) -> None:
+    """Raise ConfigError where γ is too near 1 for returns to be followed."""
+    if steps_that_count(config.gamma) == LONGEST:
+        raise invalid("gamma", config.gamma, f"at most {LEFT_OUT ** (1 / LONGEST):.4f}, so that returns can be followed to their end")
+
+
+def play(policy: Fitted, config: Config, key: Key[Array, ""], worlds: int, watch: Watch = unwatched) -> Outcomes:
+    """The outcomes of one policy in as many worlds, over `episode_length` steps, rounded up to whole chunks.
+
+    Actions are drawn from the policy. Raises as `check_horizon`.
+    """
+    check_horizon(config)
+    env = make_task(config)
+    network = make_policy(env, config)
+
+    @jax.jit
+    @jax.default_matmul_precision("highest")  # as in training
+    def go_on(policy: Fitted, episodes: Episodes, keys: jax.Array) -> tuple[Episodes, Transition]:
+        return rollout(env, acting(network, policy), episodes, keys, episode_length=2**30)
+
+    begin, draw = jax.random.split(key)
+    episodes, seen, paid = jax.jit(lambda keys: start(env, keys))(jax.random.split(begin, worlds)), [], []
+    length = -(-(config.episode_length + steps_that_count(config.gamma)) // CHUNK)
+    keys = jax.random.split(draw, (length, CHUNK, worlds))
+    compile_aside(go_on, policy, episodes, keys[0], watch=watch, what="compiling")
+    for i in range(length):
+        watch(f"playing step {i * CHUNK:,} of {length * CHUNK:,} in {worlds} worlds")
+        episodes, step = go_on(policy, episodes, keys[i])
+        seen += [step.obs] if i * CHUNK < config.episode_length else []
+        paid.append((step.reward, config.gamma * (1.0 - step.terminated)))
+    obs, (reward, discount) = jnp.concatenate(seen), (jnp.concatenate(part) for part in zip(*paid, strict=True))
+    return Outcomes(obs, *(x[: len(obs)] for x in (reward, discount, lambda_sum(reward, discount))))
