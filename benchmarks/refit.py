@@ -51,7 +51,7 @@ def row(study: Path, cell: Row) -> dict:
 def main() -> None:
     """Print a line for each policy."""
     arguments = parse(Arguments, "Value distributions that are fitted to finished policies.")
-    file, known = arguments.json, {}
+    file, known, shown = arguments.json, {}, {}
     if file and file.exists():
         known = {each["checkpoint"]: each for each in json.loads(file.read_text())["rows"]}
     cells = {f"{cell.cell}.msgpack": cell for cell in read(arguments.study).rows}
@@ -61,9 +61,9 @@ def main() -> None:
             known[name] = row(arguments.study, cells[name])
             if file:
                 file.write_text(json.dumps({"machine": machine.facts(), "rows": list(known.values())}, indent=1) + "\n")
+        shown[name.removesuffix(".msgpack")] = (which[1], known[name])
         print(f"{name:28s}{known[name]['coverage_90']:6.1%} in 90 %, CRPS {known[name]['crps']:.3f}", flush=True)
     if arguments.picture:
-        shown = {name.removesuffix(".msgpack"): (name.split("-")[1], each) for name, each in known.items()}
         curve.save(picture.histograms(shown), arguments.picture)
 
 

@@ -7,12 +7,14 @@ from dgae_jax.run import directory
 
 
 def config_of(source: Path) -> Config:
-    """The configuration of the run, without loading JAX where it can be had without; raises as `restore.config_of`."""
+    """The configuration of the run, without loading JAX where it can be had without, and never MuJoCo, which a film must do without until
+    its OpenGL is chosen; raises as `restore.config_of`.
+    """
     if not source.is_file():
         return directory.read_config(source)
-    from dgae_jax.run import restore
+    from dgae_jax.run import checkpoint
 
-    return restore.config_of(source)
+    return checkpoint.config_of(source)
 
 
 def check_index(index: int, config: Config, source: Path) -> None:

@@ -110,6 +110,15 @@ def test_learning_is_shown_checkpoint_after_checkpoint(distributional, tmp_path,
     assert length(tmp_path / "film.gif") == 19 * 80
 
 
+def test_the_file_of_a_policy_is_filmed_beside_it_and_has_nothing_to_show_from_its_training(distributional, tmp_path, opengl, run):
+    config, file = read_config(distributional), tmp_path / "policy.msgpack"
+    found = restore.trained(distributional, config, "newest")
+    restore.save_networks(file, config, found, restore.reward_std(found.path, config))
+    dgae("render", file, "--format", "gif", *SMALL)
+    assert length(tmp_path / "policy-film.gif") > 0
+    assert run("render", file, "--during")[::2] == (2, f"error: --during: must be left out with {file}, a single policy\n")
+
+
 def test_every_checkpoint_is_found_and_a_damaged_one_left_out(distributional, tmp_path, capsys):
     config = read_config(distributional)
     names = [f"steps_{steps:012d}.msgpack" for steps in (256, 512)]
