@@ -28,11 +28,11 @@ BINS = 20
 def calibrate(source: Path, config: Config, *, which: str, index: int = 0, seed: int = 0, watch: Watch = unwatched) -> dict[str, Any]:
     """Statistics of the critic of a run, or in a file, over the `outcomes` of `WORLDS` worlds, actions drawn from the policy.
 
-    Returns are of scaled rewards, as the critic's: `coverage_90` is the share
-    of them inside the central 90 % of the quantiles, `crossing` the share of neighbouring quantiles in the wrong order, `bias` and
-    `rmse` those of the mean, `spread` the mean standard deviation of the quantiles, `crps` the continuous ranked probability score,
-    `pit` the share of returns in each of `BINS` equal parts of probability, `similar_means` the shares of steps whose target and
-    prediction have similar means for their shapes (`similar`). Raises as `outcomes.play`, `restore.trained` and `restore.reward_std`.
+    Returns are of scaled rewards, as the critic's: `coverage_90` is the share of them inside the central 90 % of the quantiles,
+    `crossing` the share of neighbouring quantiles in the wrong order, `bias` and `rmse` those of the mean, `spread` the mean standard
+    deviation of the quantiles, `crps` the continuous ranked probability score, `pit` the share of returns in each of `BINS` equal
+    parts of probability, `similar_means` the shares of steps whose target and prediction have similar means for their shapes
+    (`similar`). Raises as `outcomes.play`, `restore.trained` and `restore.reward_std`.
     """
     outcomes.check_horizon(config)
     found = restore.trained(source, config, which)

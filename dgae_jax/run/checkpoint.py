@@ -121,10 +121,9 @@ def config_of(path: Path) -> Config:
 def load(path: Path, like: T, *, part: bool = False) -> T:
     """The tree of arrays saved at `path`, in which each is as `like` says (anything with shape and dtype).
 
-    With `part` the file may hold more than `like`. Raises DamagedError if the file cannot be read whole, CheckpointError if
-    an array is missing (MissingError), unknown or of another type or shape, which is seen before it is decoded, NotFiniteError if it
-    holds
-    NaN or infinity where `not_finite` says that it must not.
+    With `part` the file may hold more than `like`. Raises DamagedError if the file cannot be read whole, MissingError if an array is
+    missing, CheckpointError if one is unknown or of another type or shape, which is seen before it is decoded, NotFiniteError if it
+    holds NaN or infinity where `not_finite` says that it must not.
     """
     want = jax.eval_shape(_plain, like)
     with _body(path) as (file, size):
