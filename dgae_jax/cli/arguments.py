@@ -16,7 +16,7 @@ from dgae_jax.cli import mistakes
 from dgae_jax.cli.flags import Leaf, built, leaves, view
 from dgae_jax.cli.spelling import refuse_foreign
 from dgae_jax.configs.config import ConfigError, flag
-from dgae_jax.run import terminal
+from dgae_jax.run import compiling, terminal
 
 T = TypeVar("T")
 
@@ -29,6 +29,14 @@ def fail(mistake: Exception | str) -> NoReturn:
     shown = "".join(c if c.isprintable() else ascii(c)[1:-1] for c in message)  # one line, whatever was typed
     terminal.warn(f"error: {shown}")
     raise SystemExit(2)
+
+
+def stopped(why: str) -> int:
+    """Say why a command ends after SIGINT; 130. The process ends here where a compiler was left to itself, which would abort it."""
+    terminal.warn(why)
+    if compiling.is_running():
+        os._exit(130)
+    return 130
 
 
 def peek(argv: Sequence[str], *names: str) -> dict[str, str | None]:

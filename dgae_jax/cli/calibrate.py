@@ -10,7 +10,7 @@ from typing import Literal
 
 import tyro
 
-from dgae_jax.cli.arguments import fail, parse
+from dgae_jax.cli.arguments import fail, parse, stopped
 from dgae_jax.cli.source import check_index, check_seed, config_of
 from dgae_jax.configs.config import Config, ConfigError, invalid, resolve
 from dgae_jax.configs.parts import is_distribution
@@ -54,8 +54,7 @@ def main() -> int:
     except ConfigError as mistake:
         fail(mistake)
     except KeyboardInterrupt:
-        terminal.warn("stopped by SIGINT")
-        return 130
+        return stopped("stopped by SIGINT")
 
 
 def _checked(arguments: Arguments) -> dict[Path, Config]:

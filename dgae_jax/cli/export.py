@@ -11,7 +11,7 @@ from typing import Literal
 
 import tyro
 
-from dgae_jax.cli.arguments import fail, parse
+from dgae_jax.cli.arguments import fail, parse, stopped
 from dgae_jax.cli.source import check_index, config_of
 from dgae_jax.configs.config import Config, ConfigError, invalid, resolve
 from dgae_jax.envs.registry import spec_of
@@ -56,8 +56,7 @@ def main() -> int:
     except ConfigError as mistake:
         fail(mistake)
     except KeyboardInterrupt:
-        terminal.warn("stopped by SIGINT")
-        return 130
+        return stopped("stopped by SIGINT")
 
 
 def _checked(arguments: Arguments) -> tuple[Config, Path]:

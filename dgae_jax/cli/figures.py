@@ -9,7 +9,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import Literal, NamedTuple
 
-from dgae_jax.cli.arguments import fail, parse
+from dgae_jax.cli.arguments import fail, parse, stopped
 from dgae_jax.configs.config import ConfigError, invalid
 from dgae_jax.export import gl
 from dgae_jax.run import terminal
@@ -58,8 +58,7 @@ def main() -> int:
     except ConfigError as mistake:
         fail(mistake)
     except KeyboardInterrupt:
-        terminal.warn("stopped by SIGINT")
-        return 130
+        return stopped("stopped by SIGINT")
 
 
 def _draw(chosen: dict[str, Drawing], out: Path) -> None:

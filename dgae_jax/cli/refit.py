@@ -11,7 +11,7 @@ from typing import Literal
 
 import tyro
 
-from dgae_jax.cli.arguments import fail, parse
+from dgae_jax.cli.arguments import fail, parse, stopped
 from dgae_jax.cli.source import check_file, check_index, check_seed, config_of
 from dgae_jax.configs.config import Config, ConfigError, invalid, resolve
 from dgae_jax.run import files, terminal
@@ -39,7 +39,7 @@ class Arguments:
     index: int = 0
     """Which of the seeds that were trained side by side, from 0."""
     worlds: int = 128
-    """Worlds that are played for an episode each; of more, the tails are fitted better [worlds]."""
+    """Worlds that are played, each for as many steps as an episode may have, 1 to 10,000; more fit the tails better [worlds]."""
     seed: int = 0
     """Seed of the episodes and of the fit [1]."""
     out: Path | None = None
@@ -58,8 +58,7 @@ def main() -> int:
     except ConfigError as mistake:
         fail(mistake)
     except KeyboardInterrupt:
-        terminal.warn("stopped by SIGINT, nothing written")
-        return 130
+        return stopped("stopped by SIGINT, nothing written")
 
 
 def _checked(arguments: Arguments) -> tuple[Config, Path]:
@@ -71,6 +70,9 @@ def _checked(arguments: Arguments) -> tuple[Config, Path]:
     check_index(arguments.index, config, arguments.run_dir)
     out = arguments.out or files.beside(arguments.run_dir, "refit.msgpack")
     check_file(out)
+    own = out.exists() and out.samefile(arguments.run_dir)
+    if out.suffix != ".msgpack" or own or out.absolute().parent.name == "checkpoints":
+        raise invalid("out", out, "a file whose name ends in .msgpack, not the policy's own and not among the checkpoints of a run")
     if not os.access(out.absolute().parent, os.W_OK):
         raise invalid("out", out, "a file that can be written")
     return config, out

@@ -11,7 +11,7 @@ from typing import Literal
 
 import tyro
 
-from dgae_jax.cli.arguments import fail, parse
+from dgae_jax.cli.arguments import fail, parse, stopped
 from dgae_jax.cli.source import config_of
 from dgae_jax.configs.config import Config, ConfigError, invalid, resolve
 from dgae_jax.envs.registry import TASKS, spec_of
@@ -90,8 +90,7 @@ def main() -> int:
     except ConfigError as mistake:
         fail(mistake)
     except KeyboardInterrupt:
-        terminal.warn("stopped by SIGINT, nothing written")
-        return 130
+        return stopped("stopped by SIGINT, nothing written")
 
 
 def _check(arguments: Arguments) -> None:

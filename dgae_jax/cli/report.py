@@ -10,7 +10,7 @@ from pathlib import Path
 
 import tyro
 
-from dgae_jax.cli.arguments import fail, parse
+from dgae_jax.cli.arguments import fail, parse, stopped
 from dgae_jax.configs.config import ConfigError, invalid
 from dgae_jax.run import terminal
 
@@ -49,8 +49,7 @@ def main() -> int:
     except ConfigError as mistake:
         fail(mistake)
     except KeyboardInterrupt:
-        terminal.warn("stopped by SIGINT, the report is not complete")
-        return 130
+        return stopped("stopped by SIGINT, the report is not complete")
 
 
 def _report(arguments: Arguments) -> int:

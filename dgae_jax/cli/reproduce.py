@@ -13,7 +13,7 @@ from typing import Annotated
 import tyro
 
 from dgae_jax.cli import train
-from dgae_jax.cli.arguments import fail, parse_known
+from dgae_jax.cli.arguments import fail, parse_known, stopped
 from dgae_jax.configs.algorithms import TABLE
 from dgae_jax.configs.config import Config, ConfigError, invalid, lookup, task_spec
 from dgae_jax.envs.registry import TASKS
@@ -78,8 +78,7 @@ def main() -> int:
     except ConfigError as mistake:
         fail(mistake)
     except KeyboardInterrupt:
-        terminal.warn("stopped by SIGINT before training began")
-        return 130
+        return stopped("stopped by SIGINT before training began")
 
 
 def _cells(arguments: Arguments, rest: list[str]) -> tuple[list[matrix.Cell], RunOptions]:

@@ -2,15 +2,19 @@
 
 from pathlib import Path
 
-from dgae_jax.configs.config import Config, invalid
+from dgae_jax.configs.config import Config, ConfigError, invalid
 from dgae_jax.run import directory
 
 
 def config_of(source: Path) -> Config:
     """The configuration of the run, without loading JAX where it can be had without, and never MuJoCo, which a film must do without until
-    its OpenGL is chosen; raises as `restore.config_of`.
+    its OpenGL is chosen; raises as `restore.config_of`, and ConfigError for a path that cannot be looked at.
     """
-    if not source.is_file():
+    try:
+        is_file = source.is_file()
+    except OSError as reason:
+        raise ConfigError(f"{source}: must be a run directory, or the file of a policy ({reason.strerror})") from reason
+    if not is_file:
         return directory.read_config(source)
     from dgae_jax.run import checkpoint
 
@@ -31,7 +35,11 @@ def check_seed(seed: int) -> None:
 
 def check_file(out: Path) -> None:
     """Raise ConfigError unless a file can be written there, as far as can be seen."""
-    if not out.absolute().parent.is_dir():
+    try:
+        there, is_file = out.absolute().parent.is_dir(), not out.is_symlink() and (out.is_file() or not out.exists())
+    except OSError as reason:  # the name is too long, or lies behind a directory that may not be read
+        raise invalid("out", out, f"a file that can be written ({reason.strerror})") from reason
+    if not there:
         raise invalid("out", out, "a file in a directory that exists")
-    if out.is_symlink() or (out.exists() and not out.is_file()):
+    if not is_file:
         raise invalid("out", out, "a file, not a directory, a link or a device")

@@ -10,7 +10,7 @@ from typing import Annotated
 
 import tyro
 
-from dgae_jax.cli.arguments import fail, parse, peek
+from dgae_jax.cli.arguments import fail, parse, peek, stopped
 from dgae_jax.cli.spelling import understood
 from dgae_jax.configs.config import Config, ConfigError, invalid, resolve
 from dgae_jax.configs.presets import preset
@@ -57,8 +57,7 @@ def main() -> int:
     except ConfigError as mistake:
         fail(mistake)
     except KeyboardInterrupt:
-        terminal.warn("stopped by SIGINT before training began")
-        return 130
+        return stopped("stopped by SIGINT before training began")
 
 
 def parsed(argv: list[str]) -> tuple[Config, RunOptions]:

@@ -10,7 +10,7 @@ from importlib.util import find_spec
 from pathlib import Path
 
 from dgae_jax.cli import train
-from dgae_jax.cli.arguments import fail, parse_known
+from dgae_jax.cli.arguments import fail, parse_known, stopped
 from dgae_jax.configs.config import ConfigError, invalid
 from dgae_jax.run import terminal
 from dgae_jax.run.options import RunOptions
@@ -83,8 +83,7 @@ def main() -> int:
     except ConfigError as mistake:
         fail(mistake)
     except KeyboardInterrupt:
-        terminal.warn("stopped by SIGINT before tuning began")
-        return 130
+        return stopped("stopped by SIGINT before tuning began")
 
 
 def _tuning(argv: list[str]) -> Tuning:

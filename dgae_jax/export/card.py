@@ -84,4 +84,4 @@ def _quantiles(arrays: Mapping[str, np.ndarray]) -> int:
 
 
 def _scale(config: Config) -> str:
-    return " of rewards divided by their running scale" if config.normalize_rewards else ""
+    return " of rewards divided by a standard deviation of returns" if config.normalize_rewards else ""

@@ -23,7 +23,7 @@ def compile_aside(program: Any, *args: Any, watch: Watch = unwatched, what: str 
     """Compile a jitted function for such arguments, so that calling it does not; in a thread, while this one waits.
 
     Python runs no signal handler as long as its main thread is inside of XLA. An exception that `watch` raises leaves the
-    compiler to itself: it cannot be broken off, and holds up the end of the process unless that is `os._exit`.
+    compiler to itself: it cannot be broken off, and holds up or aborts the end of the process unless that is `os._exit`.
     """
     since, done = time.monotonic(), Future()
     watch(what)

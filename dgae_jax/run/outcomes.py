@@ -26,7 +26,7 @@ LONGEST = 50_000
 
 
 class Outcomes(NamedTuple):
-    """What N worlds showed of a policy in T steps; the episodes in them have no time limit."""
+    """What N worlds showed of a policy in T steps, through which its episodes go on without a time limit."""
 
     obs: Float[Array, "T N O"]
     reward: Float[Array, "T N"]

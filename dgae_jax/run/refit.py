@@ -79,7 +79,8 @@ def _of_one(config: Config, index: int) -> Config:
 def fitted(network: Network, samples: Samples, minibatches: int, key: Key[Array, ""], watch: Watch = unwatched) -> Params:
     """The parameters with which the network's outputs are quantiles of the samples, after `PASSES` over them.
 
-    They are fitted as they are and not sorted, which is as good and takes about half of the time.
+    A pass takes `minibatches` gradient steps. The outputs are fitted as they are and not sorted, which is as good and takes about half
+    of the time.
     """
 
     def loss(params: Params, samples: Samples):

@@ -6,13 +6,15 @@ import re
 import signal
 import subprocess
 import sys
+import threading
 import time
 
 import pytest
 
+from dgae_jax.cli import arguments
 from dgae_jax.cli.main import COMMANDS
 from dgae_jax.cli.train import parsed
-from dgae_jax.run import directory, metrics
+from dgae_jax.run import compiling, directory, metrics
 from dgae_jax.run.options import SINKS
 from tests.helpers import ROOT, TINY, command
 
@@ -223,6 +225,17 @@ def test_a_device_that_is_not_there_is_refused_in_one_line(tmp_path):
     assert (done.returncode, done.stdout) == (2, "")
     assert re.fullmatch(r"error: JAX_PLATFORMS=abacus: must name a device that JAX finds here, .*; an NVIDIA GPU needs .*\n", done.stderr)
     assert not (tmp_path / "run").exists()
+
+
+def test_a_command_that_leaves_a_compiler_to_itself_ends_before_that_aborts_it(monkeypatch, capsys):
+    codes, idle = [], threading.Event()
+    monkeypatch.setattr(os, "_exit", codes.append)
+    assert (arguments.stopped("stopped"), codes) == (130, [])
+    threading.Thread(target=idle.wait, name=compiling.THREAD, daemon=True).start()
+    arguments.stopped("stopped")
+    idle.set()
+    assert codes == [130]
+    assert capsys.readouterr().err == "stopped\nstopped\n"
 
 
 @pytest.mark.parametrize(("name", "work"), [("train", "parsed"), ("evaluate", "parse")])

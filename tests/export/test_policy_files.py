@@ -221,7 +221,7 @@ def test_the_card_says_what_the_runs_files_say(runs, tmp_path):
             "| trained on | hopper-v4, engine native, seed 0 |",
             "| samples | 512 |",
             f"| return in Hopper-v4 (gymnasium) | {worth}, mean ± standard deviation |",
-            "| critic | quantile [8], of the discounted return (γ = 0.99) of rewards divided by their running scale |",
+            "| critic | quantile [8], of the discounted return (γ = 0.99) of rewards divided by a standard deviation of returns |",
             f"| checkpoint | {last(run_dir).name} |",
             "| licence | Apache-2.0, that of dgae_jax |",
         ):

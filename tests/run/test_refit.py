@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import shutil
 
 import jax
 import jax.numpy as jnp
@@ -13,6 +14,9 @@ from dgae_jax.learn.networks import value_network
 from dgae_jax.maths.transport import quantile_midpoints
 from dgae_jax.run import directory, loop, outcomes, refit, restore
 from tests import helpers, runs
+
+POLICY = helpers.ROOT / "results" / "tuned" / "policies" / "hopper-dppo-1.msgpack"
+"""Of the table of results, from before such files said what rewards were divided by."""
 
 
 @pytest.fixture(scope="module")
@@ -78,6 +82,9 @@ def test_the_policy_stays_as_it_is_and_the_file_is_evaluated_calibrated_and_refi
     np.testing.assert_array_equal(dg.load_policy(tmp_path / "again.msgpack")(obs), whole(obs))
 
 
+ALLOWED = "a file whose name ends in .msgpack, not the policy's own and not among the checkpoints of a run"
+
+
 @pytest.mark.parametrize(
     ("argv", "message"),
     [
@@ -87,6 +94,10 @@ def test_the_policy_stays_as_it_is_and_the_file_is_evaluated_calibrated_and_refi
         (["run", "--index", "1"], "--index 1: must be a whole number from 0 to 0, the index of a seed in run"),
         (["run", "--out", "there/x.msgpack"], "--out there/x.msgpack: must be a file in a directory that exists"),
         (["run", "--out", "run"], "--out run: must be a file, not a directory, a link or a device"),
+        (["run", "--out", "run/config.json"], f"--out run/config.json: must be {ALLOWED}"),
+        (["run", "--out", "run/checkpoints/x.msgpack"], f"--out run/checkpoints/x.msgpack: must be {ALLOWED}"),
+        (["a" * 300], f"{'a' * 300}: must be a run directory, or the file of a policy (File name too long)"),
+        (["run", "--out", "a" * 300], f"--out {'a' * 300}: must be a file that can be written (File name too long)"),
         (["far"], "--gamma 0.99999: must be at most 0.9999, so that returns can be followed to their end"),
     ],
 )
@@ -100,9 +111,18 @@ def test_what_cannot_be_fitted_is_refused_in_one_line(argv, message, tmp_path, m
     assert capsys.readouterr().err == f"error: {message}\n"
 
 
+def test_a_policy_is_not_written_over_by_its_own_refit(tmp_path, monkeypatch, capsys):
+    file = tmp_path / "policy.msgpack"
+    shutil.copy(POLICY, file)
+    monkeypatch.setattr("sys.argv", ["dgae refit", str(file), "--out", str(file)])
+    with pytest.raises(SystemExit, match="2"):
+        helpers.command("refit")()
+    assert capsys.readouterr().err == f"error: --out {file}: must be {ALLOWED}\n"
+    assert file.read_bytes() == POLICY.read_bytes()
+
+
 def test_a_file_without_the_scale_of_its_rewards_is_not_compared_with_returns(monkeypatch, capsys, tmp_path):
-    file = helpers.ROOT / "results" / "tuned" / "policies" / "hopper-dppo-1.msgpack"
-    monkeypatch.setattr("sys.argv", ["dgae calibrate", str(file), "--out", str(tmp_path / "x.png")])
+    monkeypatch.setattr("sys.argv", ["dgae calibrate", str(POLICY), "--out", str(tmp_path / "x.png")])
     with pytest.raises(SystemExit, match="2"):
         helpers.command("calibrate")()
-    assert capsys.readouterr().err == f"error: {file}: does not say what rewards were divided by; dgae refit fits a critic that does\n"
+    assert capsys.readouterr().err == f"error: {POLICY}: does not say what rewards were divided by; dgae refit fits a critic that does\n"
