@@ -1,4 +1,4 @@
-"""A file of throughput.py or heads.py as a Markdown table: python benchmarks/table.py benchmarks/results/hopper-64.json"""
+"""A file of throughput.py, heads.py or refit.py as a Markdown table: python benchmarks/table.py benchmarks/results/hopper-64.json"""
 
 import json
 import sys

@@ -111,6 +111,15 @@ def test_what_ordered_quantiles_cost_is_what_three_studies_say():
     assert tables.markdown(tables.attribution(groups_of(rows))) in (ROOT / "docs" / "decisions.md").read_text()
 
 
+def test_distributions_that_are_fitted_to_finished_policies_hold_what_the_documents_say():
+    rows = json.loads((ROOT / "benchmarks" / "results" / "refit.json").read_text())["rows"]
+    held = [100 * row["coverage_90"] for row in rows]
+    assert f"all {len(rows)} hold between {min(held):.0f} and {max(held):.0f} %" in (ROOT / "docs" / "decisions.md").read_text()
+    assert not any(row["crossing"] for row in rows)
+    finals = {f"{row.cell}.msgpack": row.final for row in results.read(ROOT / "results" / "tuned").rows}
+    assert {row["checkpoint"]: row["return"] for row in rows}.items() <= finals.items()
+
+
 def test_a_committed_policy_is_there_for_every_result_and_knows_its_configuration():
     for row in results.read(ROOT / "results" / "tuned").rows:
         config = to_dict(restore.config_of(ROOT / "results" / "tuned" / "policies" / f"{row.cell}.msgpack"))
