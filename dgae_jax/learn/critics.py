@@ -98,7 +98,9 @@ def quantile(obs_size: int, *, hidden: Sequence[int], target: Target, quantiles:
 
 
 def sorted_quantile(obs_size: int, **options) -> Critic:
-    """`quantile`, whose outputs are sorted where they are used, which takes none farther from the truth (Chernozhukov et al. 2010)."""
+    """`quantile`, whose outputs are sorted where they are used, which takes them as a whole no farther from the truth (Chernozhukov et
+    al. 2010).
+    """
     plain = quantile(obs_size, **options)
     return plain._replace(predict=lambda params, obs: jnp.sort(plain.predict(params, obs)))
 
