@@ -14,7 +14,7 @@ from tempfile import TemporaryDirectory
 from dgae_jax.cli.arguments import parse
 from dgae_jax.report import calibration as picture
 from dgae_jax.report.results import Row, read
-from dgae_jax.run import curve, machine, restore
+from dgae_jax.run import curve, directory, machine, restore
 from dgae_jax.run.calibration import calibrate
 from dgae_jax.run.refit import refit
 
@@ -40,8 +40,8 @@ class Arguments:
 def row(study: Path, cell: Row) -> dict:
     """Fit and calibrate one, in other episodes than those it was fitted to."""
     source = study / "policies" / f"{cell.cell}.msgpack"
-    with TemporaryDirectory() as directory:
-        made, file = refit(source, restore.config_of(source), which="newest"), Path(directory) / source.name
+    with TemporaryDirectory() as place:
+        made, file = refit(source, directory.config_of(source), which="newest"), Path(place) / source.name
         restore.save_networks(file, made.config, made.networks, made.std)
         found = calibrate(file, made.config, which="newest")
     about = {"task": cell.env, "critic": f"refit to {cell.algo.upper()}", "seed": cell.seed, "return": cell.final}

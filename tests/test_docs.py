@@ -13,7 +13,7 @@ from dgae_jax.configs.serial import to_dict
 from dgae_jax.maths.risk import METRICS
 from dgae_jax.report import markdown, results, tables
 from dgae_jax.report.groups import groups_of
-from dgae_jax.run import restore
+from dgae_jax.run import directory
 from tests.helpers import ROOT
 
 DOCUMENTS = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
@@ -123,5 +123,5 @@ def test_distributions_that_are_fitted_to_finished_policies_hold_what_the_docume
 
 def test_a_committed_policy_is_there_for_every_result_and_knows_its_configuration():
     for row in results.read(ROOT / "results" / "tuned").rows:
-        config = to_dict(restore.config_of(ROOT / "results" / "tuned" / "policies" / f"{row.cell}.msgpack"))
+        config = to_dict(directory.config_of(ROOT / "results" / "tuned" / "policies" / f"{row.cell}.msgpack"))
         assert json.loads(json.dumps(config)) == row.config

@@ -11,10 +11,10 @@ from typing import Literal
 import tyro
 
 from dgae_jax.cli.arguments import fail, parse, stopped
-from dgae_jax.cli.source import check_index, check_seed, config_of
+from dgae_jax.cli.source import check_index, check_seed
 from dgae_jax.configs.config import Config, ConfigError, invalid, resolve
 from dgae_jax.configs.parts import is_distribution
-from dgae_jax.run import files, terminal
+from dgae_jax.run import directory, files, terminal
 from dgae_jax.run.options import RunOptions
 
 PURPOSE = "Compare the value distributions of critics with the returns that came."
@@ -64,7 +64,7 @@ def _checked(arguments: Arguments) -> dict[Path, Config]:
     names = [path.resolve().name for path in arguments.run_dirs]
     if len(set(names)) < len(names):
         raise ConfigError(f"RUN_DIRS {' '.join(names)}: must be of different names, by which their statistics are known")
-    runs = {path: resolve(config_of(path)) for path in arguments.run_dirs}
+    runs = {path: resolve(directory.config_of(path)) for path in arguments.run_dirs}
     for path, config in runs.items():
         if not is_distribution(str(config.critic.kind)):
             raise ConfigError(f"{path}: must be a run with a value distribution, not {config.algo}")

@@ -3,7 +3,6 @@
 Flags are checked before the rest is imported: JAX, MuJoCo and Brax take seconds to load.
 """
 
-import os
 import sys
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,9 +11,9 @@ from typing import Literal
 import tyro
 
 from dgae_jax.cli.arguments import fail, parse, stopped
-from dgae_jax.cli.source import check_file, check_seed, config_of
+from dgae_jax.cli.source import check_file, check_seed
 from dgae_jax.configs.config import ConfigError, invalid
-from dgae_jax.run import files, terminal
+from dgae_jax.run import directory, files, terminal
 from dgae_jax.run.engines import engine_of
 from dgae_jax.run.options import WHOLE, RunOptions
 
@@ -64,24 +63,21 @@ def main() -> int:
 
 def _check(arguments: Arguments) -> None:
     """Raise ConfigError for the first argument that is invalid."""
-    (low, high, reason), out = WHOLE["episodes"], arguments.out
+    low, high, reason = WHOLE["episodes"]
     if not low <= arguments.episodes <= high:
         raise invalid("episodes", arguments.episodes, f"a whole number from {low:,} to {high:,} ({reason})")
     check_seed(arguments.seed)
-    if out:
-        check_file(out)
 
 
 def _evaluate(arguments: Arguments) -> int:
-    config = config_of(arguments.run_dir)
+    config = directory.config_of(arguments.run_dir)
     from dgae_jax.run import evaluation, machine
     from dgae_jax.run.progress import Reporter
     from dgae_jax.run.summary import describe
 
     engine = engine_of(config, arguments.engine)
     out = arguments.out or evaluation.default_path(arguments.run_dir, engine, arguments.checkpoint)
-    if not os.access(out.absolute().parent, os.W_OK):
-        raise invalid("out", out, "a file that can be written")
+    check_file(out)
     machine.use_devices(config, RunOptions(devices=1, num_processes=1))
     machine.use_cache(arguments.cache_dir)
     how = {"which": arguments.checkpoint, "engine": engine, "episodes": arguments.episodes, "seed": arguments.seed}

@@ -12,11 +12,11 @@ from typing import Literal
 import tyro
 
 from dgae_jax.cli.arguments import fail, parse, stopped
-from dgae_jax.cli.source import check_index, config_of
+from dgae_jax.cli.source import check_index
 from dgae_jax.configs.config import Config, ConfigError, invalid, resolve
 from dgae_jax.envs.registry import spec_of
 from dgae_jax.export import graph
-from dgae_jax.run import files, terminal
+from dgae_jax.run import directory, files, terminal
 from dgae_jax.run.options import RunOptions
 
 PURPOSE = "Take a trained policy and its critic out of a run, for programs without JAX."
@@ -65,7 +65,7 @@ def _checked(arguments: Arguments) -> tuple[Config, Path]:
         raise invalid("to", "nothing", "one or more of npz, onnx, gymnasium")
     if "onnx" in arguments.to:
         graph.check_extra()
-    config = resolve(config_of(arguments.run_dir))
+    config = resolve(directory.config_of(arguments.run_dir))
     check_index(arguments.index, config, arguments.run_dir)
     if "gymnasium" in arguments.to and spec_of(config.env).referee() is None:
         raise invalid("to", "gymnasium", f"left out with {config.env}, which Gymnasium does not play")

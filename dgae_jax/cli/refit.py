@@ -3,7 +3,6 @@
 Flags are checked before the rest is imported: JAX, MuJoCo and Brax take seconds to load.
 """
 
-import os
 import sys
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,9 +11,9 @@ from typing import Literal
 import tyro
 
 from dgae_jax.cli.arguments import fail, parse, stopped
-from dgae_jax.cli.source import check_file, check_index, check_seed, config_of
+from dgae_jax.cli.source import check_file, check_index, check_seed
 from dgae_jax.configs.config import Config, ConfigError, invalid, resolve
-from dgae_jax.run import files, terminal
+from dgae_jax.run import directory, files, terminal
 from dgae_jax.run.options import RunOptions
 
 PURPOSE = "Fit a value distribution to the returns of a policy held fixed."
@@ -66,15 +65,13 @@ def _checked(arguments: Arguments) -> tuple[Config, Path]:
     if not 1 <= arguments.worlds <= MOST_WORLDS:
         raise invalid("worlds", arguments.worlds, f"a whole number from 1 to {MOST_WORLDS:,}")
     check_seed(arguments.seed)
-    config = resolve(config_of(arguments.run_dir))
+    config = resolve(directory.config_of(arguments.run_dir))
     check_index(arguments.index, config, arguments.run_dir)
     out = arguments.out or files.beside(arguments.run_dir, "refit.msgpack")
     check_file(out)
     own = out.exists() and out.samefile(arguments.run_dir)
     if out.suffix != ".msgpack" or own or out.absolute().parent.name == "checkpoints":
         raise invalid("out", out, "a file whose name ends in .msgpack, not the policy's own and not among the checkpoints of a run")
-    if not os.access(out.absolute().parent, os.W_OK):
-        raise invalid("out", out, "a file that can be written")
     return config, out
 
 

@@ -3,7 +3,6 @@
 Flags are checked, and the OpenGL to draw with is chosen, before the rest is imported: JAX and MuJoCo take seconds to load.
 """
 
-import os
 import sys
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,11 +11,11 @@ from typing import Literal
 import tyro
 
 from dgae_jax.cli.arguments import fail, parse, stopped
-from dgae_jax.cli.source import config_of
+from dgae_jax.cli.source import check_file
 from dgae_jax.configs.config import Config, ConfigError, invalid, resolve
 from dgae_jax.envs.registry import TASKS, spec_of
 from dgae_jax.export import gl, video
-from dgae_jax.run import files, terminal
+from dgae_jax.run import directory, files, terminal
 from dgae_jax.run.options import RunOptions
 
 PURPOSE = "Make a film of the deterministic policy of a trained run, in Gymnasium."
@@ -113,17 +112,13 @@ def _check(arguments: Arguments) -> None:
 
 def _check_out(arguments: Arguments) -> None:
     stem = _stem(arguments)
-    if not os.access(stem.absolute().parent, os.W_OK):
-        raise invalid("out", stem, "a file in a directory that can be written")
     for kind in video.FORMATS[arguments.format]:
-        path = stem.with_name(f"{stem.name}.{kind}")
-        if path.is_symlink() or (path.exists() and not path.is_file()):
-            raise invalid("out", path, "a file, not a directory, a link or a device")
+        check_file(stem.with_name(f"{stem.name}.{kind}"))
 
 
 def _config(path: Path, index: int) -> Config:
     """The configuration of a run that Gymnasium can play."""
-    config = resolve(config_of(path))
+    config = resolve(directory.config_of(path))
     if not spec_of(config.env).referees:
         raise ConfigError(f"{path}: must be a run of {', '.join(TASKS)}, which can be filmed; it is one of {config.env}")
     if index >= config.num_seeds:

@@ -1,24 +1,9 @@
-"""Where a command finds a trained policy: a run directory, or the file of a policy."""
+"""What commands that take a trained policy check: which of the seeds, the seed of episodes, and the file to write."""
 
+import os
 from pathlib import Path
 
-from dgae_jax.configs.config import Config, ConfigError, invalid
-from dgae_jax.run import directory
-
-
-def config_of(source: Path) -> Config:
-    """The configuration of the run, without loading JAX where it can be had without, and never MuJoCo, which a film must do without until
-    its OpenGL is chosen; raises as `restore.config_of`, and ConfigError for a path that cannot be looked at.
-    """
-    try:
-        is_file = source.is_file()
-    except OSError as reason:
-        raise ConfigError(f"{source}: must be a run directory, or the file of a policy ({reason.strerror})") from reason
-    if not is_file:
-        return directory.read_config(source)
-    from dgae_jax.run import checkpoint
-
-    return checkpoint.config_of(source)
+from dgae_jax.configs.config import Config, invalid
 
 
 def check_index(index: int, config: Config, source: Path) -> None:
@@ -43,3 +28,5 @@ def check_file(out: Path) -> None:
         raise invalid("out", out, "a file in a directory that exists")
     if not is_file:
         raise invalid("out", out, "a file, not a directory, a link or a device")
+    if not os.access(out.absolute().parent, os.W_OK):
+        raise invalid("out", out, "a file that can be written")

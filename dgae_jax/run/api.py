@@ -16,7 +16,7 @@ from dgae_jax.configs.config import Config, ConfigError, invalid, resolve
 from dgae_jax.envs.base import Env
 from dgae_jax.envs.registry import given
 from dgae_jax.learn.types import Fitted
-from dgae_jax.run import loop, metrics, restore, terminal
+from dgae_jax.run import directory, loop, metrics, restore, terminal
 from dgae_jax.run.options import RunOptions
 from dgae_jax.run.training import RunError
 
@@ -95,7 +95,7 @@ def load_policy(run_dir: str | Path, which: str = "newest", *, seed: int = 0, en
     no checkpoint can be read.
     """
     with given(env) as name:
-        config = resolve(restore.config_of(Path(run_dir)))
+        config = resolve(directory.config_of(Path(run_dir)))
         if name not in (None, config.env):
             raise invalid("env", name, f"left out: {run_dir} is a run of {config.env}")
         return _load(Path(run_dir), config, which, seed)

@@ -148,6 +148,22 @@ def hold(file: IO, in_use: ConfigError) -> None:
         terminal.warn(f"warning: {file.name} cannot be locked ({reason.strerror}): train in it with one process only")
 
 
+def config_of(source: Path) -> Config:
+    """The configuration of a run directory, or of the file of a policy; raises ConfigError if it is neither.
+
+    JAX is loaded for a file only, and MuJoCo never, which a film must do without until its OpenGL is chosen.
+    """
+    try:
+        is_file = source.is_file()
+    except OSError as reason:
+        raise ConfigError(f"{source}: must be a run directory, or the file of a policy ({reason.strerror})") from reason
+    if not is_file:
+        return read_config(source)
+    from dgae_jax.run import checkpoint
+
+    return checkpoint.config_of(source)
+
+
 def read_config(path: Path) -> Config:
     """The configuration of a run; raises ConfigError if `path` is not a run directory, or one with links or devices in it."""
     if not path.is_dir():

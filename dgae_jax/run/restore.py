@@ -14,7 +14,7 @@ from dgae_jax.configs.build import make_task, make_trainer, seed_keys
 from dgae_jax.configs.config import Config, invalid
 from dgae_jax.configs.serial import MAY_CHANGE, differences
 from dgae_jax.learn.types import Fitted, TrainState
-from dgae_jax.run import checkpoint, directory, terminal
+from dgae_jax.run import checkpoint, terminal
 from dgae_jax.run.checkpoint import CheckpointError, DamagedError, MissingError
 from dgae_jax.run.evaluations import EvaluationsFile
 
@@ -38,11 +38,6 @@ def training_state(run_dir: Path, config: Config) -> tuple[TrainState, Path]:
     Raises CheckpointError if there is none, or it is of another run than `config`.
     """
     return _newest(run_dir, partial(load_state, config=config))
-
-
-def config_of(source: Path) -> Config:
-    """Of a run directory, or of a file with networks; raises ConfigError if it is neither."""
-    return checkpoint.config_of(source) if source.is_file() else directory.read_config(source)
 
 
 def trained(source: Path, config: Config, which: str) -> Trained:

@@ -49,7 +49,7 @@ def test_a_return_that_is_lost_one_time_in_four_is_lost_in_one_quantile_in_four(
 
 @pytest.mark.slow  # programs of their own are compiled
 @pytest.mark.parametrize("algo", ["ppo", "dppo"])
-def test_the_policy_stays_as_it_is_and_the_file_is_evaluated_calibrated_and_refitted_to_the_same_bits(algo, tmp_path, monkeypatch, capsys):
+def test_the_policy_stays_as_it_is_and_the_file_is_loaded_calibrated_and_refitted_to_the_same_bits(algo, tmp_path, monkeypatch, capsys):
     loop.start(runs.small(algo, seeds=2), dataclasses.replace(runs.QUIET, run_dir=tmp_path / "run"))
     config = directory.read_config(tmp_path / "run")
 
@@ -67,7 +67,7 @@ def test_the_policy_stays_as_it_is_and_the_file_is_evaluated_calibrated_and_refi
     assert alone.quantiles(obs).shape == (100, 8 if algo == "dppo" else 64)
     assert (np.diff(alone.quantiles(obs)) >= 0).all()
 
-    after = restore.config_of(file)
+    after = directory.config_of(file)
     assert (after.seed, after.num_seeds, after.critic.kind) == (config.seed + 1, 1, "sorted")
     assert restore.reward_std(file, after) > 0
     dgae("calibrate", file)

@@ -13,7 +13,7 @@ import pytest
 
 import dgae_jax as dg
 from dgae_jax.cli.reproduce import main
-from dgae_jax.run import files, metrics, restore
+from dgae_jax.run import directory, files, metrics
 from dgae_jax.run.evaluation import evaluate_run
 from tests import studies
 from tests.runs import last
@@ -58,7 +58,7 @@ def test_the_policy_of_a_cell_gives_its_returns_again(whole):
     study, _ = whole
     for row in studies.rows(study):
         file = study / row["policy"]
-        found = evaluate_run(file, restore.config_of(file), which="newest", episodes=2)
+        found = evaluate_run(file, directory.config_of(file), which="newest", episodes=2)
         assert found["returns"] == row["final"]["returns"]
         assert dg.load_policy(file)(np.zeros(11)).shape == (3,)
         assert file.stat().st_size < 20_000
