@@ -3,7 +3,6 @@
 Flags are checked before the rest is imported: JAX, MuJoCo and Brax take seconds to load.
 """
 
-import os
 import sys
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,7 +11,7 @@ from typing import Literal
 import tyro
 
 from dgae_jax.cli.arguments import fail, parse, stopped
-from dgae_jax.cli.source import check_index
+from dgae_jax.cli.source import check_directory, check_index
 from dgae_jax.configs.config import Config, ConfigError, invalid, resolve
 from dgae_jax.envs.registry import spec_of
 from dgae_jax.export import graph
@@ -70,18 +69,8 @@ def _checked(arguments: Arguments) -> tuple[Config, Path]:
     if "gymnasium" in arguments.to and spec_of(config.env).referee() is None:
         raise invalid("to", "gymnasium", f"left out with {config.env}, which Gymnasium does not play")
     out = arguments.out or files.beside(arguments.run_dir, "export")
-    if not _can_be_written(out):
-        raise invalid("out", out, "a directory that can be written")
+    check_directory(out)
     return config, out
-
-
-def _can_be_written(out: Path) -> bool:
-    """As far as can be seen from what exists of the path."""
-    try:
-        above = next(path for path in (out.absolute(), *out.absolute().parents) if path.exists())
-    except OSError:  # the name is too long, or lies behind a directory that may not be read
-        return False
-    return above.is_dir() and os.access(above, os.W_OK)
 
 
 def _export(arguments: Arguments, config: Config, out: Path) -> int:

@@ -11,7 +11,7 @@ from typing import Literal
 import tyro
 
 from dgae_jax.cli.arguments import fail, parse, stopped
-from dgae_jax.cli.source import check_file
+from dgae_jax.cli.source import check_file, check_index
 from dgae_jax.configs.config import Config, ConfigError, invalid, resolve
 from dgae_jax.envs.registry import TASKS, spec_of
 from dgae_jax.export import gl, video
@@ -63,7 +63,6 @@ class Arguments:
 
 
 WHOLE = {
-    "index": (0, 99_999, 1),
     "episodes": (1, 1_000, 1),
     "seed": (0, 2**31 - 1, 1),
     "width": (160, 1920, 2),
@@ -121,8 +120,7 @@ def _config(path: Path, index: int) -> Config:
     config = resolve(directory.config_of(path))
     if not spec_of(config.env).referees:
         raise ConfigError(f"{path}: must be a run of {', '.join(TASKS)}, which can be filmed; it is one of {config.env}")
-    if index >= config.num_seeds:
-        raise invalid("index", index, f"below {config.num_seeds}, the number of seeds in {path}")
+    check_index(index, config, path)
     return config
 
 

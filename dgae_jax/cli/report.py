@@ -3,7 +3,6 @@
 Flags are checked before the rest is imported: Matplotlib takes a second to load.
 """
 
-import os
 import sys
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,6 +10,7 @@ from pathlib import Path
 import tyro
 
 from dgae_jax.cli.arguments import fail, parse, stopped
+from dgae_jax.cli.source import check_directory
 from dgae_jax.configs.config import ConfigError, invalid
 from dgae_jax.run import terminal
 
@@ -62,7 +62,7 @@ def _report(arguments: Arguments) -> int:
         raise invalid("markdown", arguments.markdown, "left out where several studies are compared")
     studies = [results.read(path) for path in arguments.studies]
     out = arguments.out or studies[0].directory / "report"
-    _check_out(out)
+    check_directory(out)
     known = published.read() if arguments.published else []
     from dgae_jax.cli import films
     from dgae_jax.report import groups, markdown, write
@@ -78,15 +78,6 @@ def _report(arguments: Arguments) -> int:
         names = markdown.replace(arguments.markdown, groups.groups_of(studies[0].rows), studies[0].name)
         terminal.say(f"written {arguments.markdown}: {', '.join(names)}")
     return 0
-
-
-def _check_out(out: Path) -> None:
-    """Raise ConfigError unless a directory is there, or can be made, that can be written."""
-    if out.exists() and not out.is_dir():
-        raise invalid("out", out, "a directory")
-    nearest = next(path for path in (out.absolute(), *out.absolute().parents) if path.exists())
-    if not (nearest.is_dir() and os.access(nearest, os.W_OK)):
-        raise invalid("out", out, "a directory that can be written")
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""What commands that take a trained policy check: which of the seeds, the seed of episodes, and the file to write."""
+"""What several commands check: which of the trained seeds, the seed of episodes, and where they write."""
 
 import os
 from pathlib import Path
@@ -30,3 +30,13 @@ def check_file(out: Path) -> None:
         raise invalid("out", out, "a file, not a directory, a link or a device")
     if not os.access(out.absolute().parent, os.W_OK):
         raise invalid("out", out, "a file that can be written")
+
+
+def check_directory(out: Path) -> None:
+    """Raise ConfigError unless a directory that can be written is there, or can be made, as far as can be seen from what exists."""
+    try:
+        above = next(path for path in (out.absolute(), *out.absolute().parents) if path.exists())
+    except OSError as reason:  # as above
+        raise invalid("out", out, f"a directory that can be written ({reason.strerror})") from reason
+    if not (above.is_dir() and os.access(above, os.W_OK)):
+        raise invalid("out", out, "a directory that can be written")

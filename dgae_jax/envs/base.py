@@ -4,10 +4,11 @@ engine of that name, where it cannot print that Warp is not installed.
 
 import dgae_jax.physics.mjx  # noqa: F401, I001
 import brax.envs
+import jax
 from brax.envs.base import Env, State, Wrapper
 from jaxtyping import Array
 
-__all__ = ["Env", "State", "Wrapper", "brax", "restart"]
+__all__ = ["Env", "State", "Wrapper", "brax", "has_limit", "restart"]
 
 
 def restart(env: Env, state: State, rng: Array, done: Array) -> State:
@@ -18,3 +19,8 @@ def restart(env: Env, state: State, rng: Array, done: Array) -> State:
     """
     own = getattr(type(env), "restart", None)  # a wrapper passes on what its environment has, which is not its own
     return env.reset(rng) if own is None else own(env, state, rng, done)
+
+
+def has_limit(env: Env) -> bool:
+    """Whether the task may cut an episode short itself, which it says by `truncation` in `info`, as Brax has it."""
+    return "truncation" in jax.eval_shape(env.reset, jax.random.key(0)).info

@@ -4,7 +4,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from dgae_jax.envs import contract
-from dgae_jax.envs.base import Env, Wrapper
+from dgae_jax.envs.base import Env, State, Wrapper, restart
 from dgae_jax.envs.registry import CUSTOM, GIVEN
 
 
@@ -17,6 +17,10 @@ class Given(Wrapper):
         own = getattr(self.env, "action_range", (-1.0, 1.0))
         low, high = (jnp.broadcast_to(jnp.asarray(each, float), self.action_size) for each in own)
         return low, high
+
+    def restart(self, state: State, rng: Array, done: Array) -> State:
+        """Its own, where it has one."""
+        return restart(self.env, state, rng, done)
 
 
 def with_range(env: Env) -> Env:

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Key
 
 from dgae_jax.envs.base import Env
-from dgae_jax.learn.rollout import finite, where
+from dgae_jax.learn.rollout import ends, finite, where
 
 
 class Worlds(NamedTuple):
@@ -77,7 +77,8 @@ def disabled(env: Env, limit: int, worlds: Worlds, action: Float[Array, "N A"]) 
     stays = before.obs, *jax.tree.map(jnp.zeros_like, (after.reward, after.metrics))
     obs, reward, metrics = where(valid, (after.obs, after.reward, after.metrics), stays)
     steps = worlds.steps + 1
-    terminated, truncated = (after.done > 0) | ~valid, steps >= limit
+    over, truncated = ends(after, steps >= limit)
+    terminated = over | ~valid
     moved = worlds._replace(state=after.replace(obs=obs), steps=steps, over=terminated | truncated)
     return moved, Step(obs, reward, terminated, truncated, {**metrics, "nonfinite": ~valid})
 

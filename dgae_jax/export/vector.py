@@ -19,7 +19,8 @@ from jaxtyping import ArrayLike, Bool, Float, UInt8
 
 from dgae_jax.configs.config import Config, invalid
 from dgae_jax.envs.base import Env
-from dgae_jax.envs.registry import TASKS, make_env
+from dgae_jax.envs.registry import TASKS, make_env, spec_of
+from dgae_jax.envs.task import Task
 from dgae_jax.export.stage import CAMERAS, Stage
 from dgae_jax.export.stepping import MODES, Worlds, blank, keys_of, renew
 from dgae_jax.learn.rollout import where
@@ -35,7 +36,8 @@ class VectorTask(VectorEnv):
 
     def __init__(self, env: Env, num_envs: int, mode: AutoresetMode, limit: int, stage: partial[Stage] | None):
         self.env, self.num_envs, self._mode, self._new_stage = env, num_envs, mode, stage
-        self.metadata = {"autoreset_mode": mode, "render_modes": ["rgb_array"], "render_fps": round(1 / float(env.dt))}
+        drawn = {"render_modes": ["rgb_array"], "render_fps": round(1 / float(env.dt))} if isinstance(env, Task) else {"render_modes": []}
+        self.metadata = {"autoreset_mode": mode, **drawn}
         self.render_mode = None if stage is None else "rgb_array"
         obs: Any = jax.eval_shape(env.reset, jax.random.key(0)).obs
         low, high = (np.asarray(x, np.float32) for x in env.action_range)
@@ -191,6 +193,8 @@ def make_vector_env(
     if render_mode is not None and (render_mode != "rgb_array" or name not in CAMERAS):
         raise invalid("render_mode", render_mode, f"left out, or rgb_array with {', '.join(CAMERAS)}")
     env = make_env(name, physics=physics, version=version, **task_parameters)
+    if spec_of(name).on_host:
+        raise invalid("name", name, "a task in JAX; gymnasium.make_vec makes those of Gymnasium")
     stage = None if render_mode is None else partial(Stage, name, version, width=SIZE, height=SIZE)
     return VectorTask(env, int(num_envs), mode, int(max_episode_steps), stage)
 

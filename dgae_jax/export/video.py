@@ -1,6 +1,7 @@
 """From frames to files: MP4 by the encoder that imageio-ffmpeg brings, GIF by Pillow, in one pass over the frames."""
 
 import io
+import math
 import tempfile
 from collections import deque
 from collections.abc import Iterable, Iterator
@@ -45,7 +46,7 @@ def write(frames: Iterable[np.ndarray], stem: Path, formats: tuple[str, ...], fp
 
     Nothing is written before all is encoded. Raises OSError for a file that cannot be written, ValueError without frames.
     """
-    frames, every, thumbnails = iter(frames), max(1, round(fps / GIF_FPS)), []
+    frames, every, thumbnails = iter(frames), math.ceil(fps / GIF_FPS), []
     first = next(frames, None)
     if first is None:
         raise ValueError("a film has at least one frame")

@@ -73,7 +73,7 @@ def _record(episodes: Episodes, attempt: Any, valid: Bool[Array, " N"]) -> Episo
     return episodes._replace(nonfinite=episodes.nonfinite + ~valid, incident=where(valid, episodes.incident, attempt))
 
 
-def _ends(state: Any, late: Bool[Array, " N"]) -> tuple[Bool[Array, " N"], Bool[Array, " N"]]:
+def ends(state: Any, late: Bool[Array, " N"]) -> tuple[Bool[Array, " N"], Bool[Array, " N"]]:
     """Which worlds the task ended, and which were cut short: those that are `late`, and those that the task says are done with
     `truncation` in `info`, as Brax has it.
     """
@@ -114,7 +114,7 @@ def rollout(env: Env, act: Act, episodes: Episodes, keys: Key[Array, "T N"], *, 
         action, log_prob = act(act_keys, before.obs)
         after = jax.vmap(env.step)(before, jnp.clip(action, low, high))
         valid = finite((before.obs, action, log_prob, after.pipeline_state, after.reward, after.obs, after.done))
-        over, cut = _ends(after, episodes.steps + 1 >= episode_length)
+        over, cut = ends(after, episodes.steps + 1 >= episode_length)
         terminated = over | ~valid
         truncated = ~terminated & cut
         step = Transition(before.obs, action, log_prob, after.reward, terminated, truncated, after.obs, valid)  # pyright: ignore[reportArgumentType]

@@ -11,8 +11,6 @@ import numpy as np
 Strata = Sequence[np.ndarray]
 """Scores [..., S] of each task."""
 
-Interval = tuple[float, float]
-
 REPLICATES = 10_000
 """Draws of the bootstrap: the ends of an interval are then sure to about a hundredth of its width."""
 

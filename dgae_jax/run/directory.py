@@ -70,8 +70,11 @@ def _move(made: Path, path: Path) -> None:
 
 
 def has_begun(path: Path) -> bool:
-    """Whether a run was made at `path`, so that it can be resumed."""
-    return (path / "config.json").exists()
+    """Whether a run was made at `path`, so that it can be resumed; not where that cannot be seen."""
+    try:
+        return (path / "config.json").exists()
+    except OSError:  # the name is too long, or lies behind a directory that may not be read
+        return False
 
 
 def _is_empty(path: Path) -> bool:
@@ -153,20 +156,23 @@ def config_of(source: Path) -> Config:
 
     JAX is loaded for a file only, and MuJoCo never, which a film must do without until its OpenGL is chosen.
     """
-    try:
-        is_file = source.is_file()
-    except OSError as reason:
-        raise ConfigError(f"{source}: must be a run directory, or the file of a policy ({reason.strerror})") from reason
-    if not is_file:
+    if not _kind(source, Path.is_file):
         return read_config(source)
     from dgae_jax.run import checkpoint
 
     return checkpoint.config_of(source)
 
 
+def _kind(path: Path, test: Callable[[Path], bool]) -> bool:
+    try:
+        return test(path)
+    except OSError as reason:
+        raise ConfigError(f"{path}: must be a run directory, or the file of a policy ({reason.strerror})") from reason
+
+
 def read_config(path: Path) -> Config:
     """The configuration of a run; raises ConfigError if `path` is not a run directory, or one with links or devices in it."""
-    if not path.is_dir():
+    if not _kind(path, Path.is_dir):
         raise ConfigError(f"{path}: must be a run directory; there is {'a file' if path.exists() else 'nothing'} of that name")
     for name in ("checkpoints", "nonfinite", "tensorboard", "wandb", "mlflow"):
         _check_own(path / name, "directory", stat.S_ISDIR)

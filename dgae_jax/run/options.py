@@ -74,7 +74,7 @@ def validate_options(options: RunOptions, config: Config) -> None:
     engine_of(config, options.eval_engine, "eval_engine")
     for name, (low, high, reason) in WHOLE.items():
         value = getattr(options, name)
-        if value is not None and not low <= value <= high:
+        if value is not None and not (type(value) is int and low <= value <= high):
             raise invalid(name, value, f"a whole number from {low:,} to {high:,} ({reason})")
     _validate_log(options.log)
     if options.coordinator is not None:

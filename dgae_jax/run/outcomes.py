@@ -9,6 +9,7 @@ from jaxtyping import Array, Float, Key
 
 from dgae_jax.configs.build import make_policy, make_task
 from dgae_jax.configs.config import Config, invalid
+from dgae_jax.envs.base import has_limit
 from dgae_jax.learn.iteration import acting
 from dgae_jax.learn.rollout import Episodes, rollout, start
 from dgae_jax.learn.types import Fitted, Transition
@@ -41,18 +42,20 @@ def steps_that_count(gamma: float) -> int:
     return int(np.count_nonzero(gamma ** np.arange(LONGEST) > LEFT_OUT))
 
 
-def check_horizon(config: Config) -> None:
-    """Raise ConfigError where γ is too near 1 for returns to be followed."""
+def check(config: Config) -> None:
+    """Raise ConfigError where returns cannot be followed to their end: γ is too near 1, or the task cuts episodes short itself."""
     if steps_that_count(config.gamma) == LONGEST:
         raise invalid("gamma", config.gamma, f"at most {LEFT_OUT ** (1 / LONGEST):.4f}, so that returns can be followed to their end")
+    if has_limit(make_task(config)):
+        raise invalid("env", config.env, "a task without a time limit of its own, which cuts returns short")
 
 
 def play(policy: Fitted, config: Config, key: Key[Array, ""], worlds: int, watch: Watch = unwatched) -> Outcomes:
     """The outcomes of one policy in as many worlds, over `episode_length` steps, rounded up to whole chunks.
 
-    Actions are drawn from the policy. Raises as `check_horizon`.
+    Actions are drawn from the policy. Raises as `check`.
     """
-    check_horizon(config)
+    check(config)
     env = make_task(config)
     network = make_policy(env, config)
 

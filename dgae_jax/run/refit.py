@@ -55,7 +55,7 @@ def refit(
 
     Returns are scaled by their standard deviation. Raises as `outcomes.play` and `restore.trained`.
     """
-    outcomes.check_horizon(config)
+    outcomes.check(config)
     found = restore.trained(source, config, which)
     policy = jax.tree.map(lambda x: x[index], found.policy)
     play_key, fit_key = jax.random.split(jax.random.key(seed))  # not the episodes of `calibrate` with the same seed

@@ -140,6 +140,8 @@ def test_evaluating_twice_gives_the_same_returns(trained, run, tmp_path):
         (["--cache-dir", "/dev/null/below"], r"--cache-dir /dev/null/below: must be a directory that can be written, or none"),
         (["--episodes", "0"], r"--episodes 0: must be a whole number from 1 to 10,000"),
         (["--checkpoint-every", "0"], r"--checkpoint-every 0: must be a whole number from 1 to"),
+        (["--resume", "x" * 300], r"x+: must be a run directory, or the file of a policy \(File name too long\)"),
+        (["--resume-or-start", "--run-dir", "x" * 300], r"--run-dir x+: must be a directory that can be written \(File name too long\)"),
         (["--inexact"], r"--inexact True: must be left out without --resume"),
         (["--num-envs", "1e9", "--horizon", "1", "--policy.minibatches", "1", "--critic.minibatches", "1", "--total-steps", "1e9"],
          r"--num-envs 1000000000: must be smaller: the run needs at least [\d,.]+ GiB of memory, and there are [\d.,]+ GiB"),

@@ -86,3 +86,16 @@ def test_a_truncation_that_an_environment_marks_is_one_and_the_next_episode_is_f
     assert_array_equal(jnp.flatnonzero(step.truncated), [4, 9])
     assert not step.terminated.any()
     assert_array_equal(step.next_obs[:, 0, 0], [1, 2, 3, 4, 5, 1, 2, 3, 4, 5, 1, 2])
+
+
+def test_a_restart_of_its_own_begins_the_next_episode(key):
+    class Lazy(Counter):
+        def restart(self, state, rng, done):
+            return self.reset(rng).replace(obs=jnp.array([100.0, 0.0]))
+
+    def act(keys, obs):
+        return jnp.zeros((len(obs), 1)), jnp.zeros(len(obs))
+
+    env = made(Lazy(length=3))
+    _, step = rollout(env, act, start(env, key[None]), jnp.tile(key, (5, 1)), episode_length=100)
+    assert_array_equal(step.obs[:, 0, 0], [0, 1, 2, 100, 100])

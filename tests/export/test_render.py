@@ -171,7 +171,7 @@ def test_render_refuses_a_run_that_gymnasium_cannot_play_a_seed_that_is_not_ther
     monkeypatch.setattr(gl, "choose", lambda: pytest.fail("it was not refused"))
     shutil.copytree(distributional, tmp_path / "run")
     assert run("render", tmp_path / "run", "--index", 1)[::2] == (
-        2, f"error: --index 1: must be below 1, the number of seeds in {tmp_path / 'run'}\n",
+        2, f"error: --index 1: must be a whole number from 0 to 0, the index of a seed in {tmp_path / 'run'}\n",
     )  # fmt: skip
     assert re.fullmatch(r"error: --out .*: must be a file in a directory .*\n", run("render", tmp_path / "run", "--out", "/nowhere/x")[2])
     (tmp_path / "film.gif").mkdir()

@@ -11,6 +11,7 @@ import gymnasium
 import jax
 import numpy as np
 import pytest
+from brax.envs.wrappers.training import EpisodeWrapper
 from gymnasium.envs.registration import EnvSpec
 from gymnasium.error import ClosedEnvironmentError, ResetNeeded
 from gymnasium.utils.env_checker import check_env
@@ -19,10 +20,12 @@ from gymnasium.wrappers.vector import NormalizeObservation, RecordEpisodeStatist
 from numpy.testing import assert_allclose, assert_array_equal
 
 import dgae_jax as dg
+from dgae_jax.envs.registry import given
 from dgae_jax.export import gl
 from dgae_jax.physics.registry import ENGINES
 from tests.helpers import GYM_TASKS
 from tests.parity import WARP
+from tests.probes import Counter
 
 MODES = [mode.value for mode in AutoresetMode]
 
@@ -329,3 +332,20 @@ assert one.std() > 10 and (one != two).any()
 env.close()
 """
     subprocess.run([sys.executable, "-c", program], check=True, env={**os.environ, gl.VARIABLE: backend})
+
+
+def test_a_time_limit_of_the_tasks_own_is_a_truncation():
+    with given(EpisodeWrapper(Counter(), 5, 1)) as name:
+        envs = dg.make_vector_env(name, 2)
+    envs.reset(seed=0)
+    ends = [envs.step(np.zeros((2, 1)))[2:4] for _ in range(5)]
+    assert not np.any([terminated for terminated, _ in ends])
+    assert_array_equal([truncated for _, truncated in ends], [[False] * 2] * 4 + [[True] * 2])
+    assert envs.metadata["render_modes"] == []
+
+
+def test_tasks_that_live_on_the_host_are_refused():
+    with pytest.raises(
+        ValueError, match=r"name gymnasium:Pendulum-v1: must be a task in JAX; gymnasium\.make_vec makes those of Gymnasium"
+    ):
+        dg.make_vector_env("gymnasium:Pendulum-v1", 2)

@@ -60,6 +60,8 @@ def test_a_run_is_evaluated_where_asked_to_and_in_an_engine_of_ours_with_the_noi
     [
         (dataclasses.replace(small(), gamma=1.5), {}, "gamma 1.5: must be"),
         (small(), {"episodes": 0}, "episodes 0: must be"),
+        (small(), {"checkpoint_every": 5e4}, r"checkpoint_every 50000\.0: must be a whole number from 1 to"),
+        (small(), {"episodes": "5"}, "episodes 5: must be a whole number"),
         (small(), {"eval_engine": "mujoco"}, "eval_engine mujoco: must be one of gymnasium, "),
         (small(), {"episode": 3}, "episode: must be one of cache_dir, "),
         (small(), {"resume": "x"}, "resume: must be one of cache_dir, "),

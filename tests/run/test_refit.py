@@ -99,12 +99,15 @@ ALLOWED = "a file whose name ends in .msgpack, not the policy's own and not amon
         (["a" * 300], f"{'a' * 300}: must be a run directory, or the file of a policy (File name too long)"),
         (["run", "--out", "a" * 300], f"--out {'a' * 300}: must be a file that can be written (File name too long)"),
         (["far"], "--gamma 0.99999: must be at most 0.9999, so that returns can be followed to their end"),
+        (["cut"], "--env gymnasium:Pendulum-v1: must be a task without a time limit of its own, which cuts returns short"),
     ],
 )
 def test_what_cannot_be_fitted_is_refused_in_one_line(argv, message, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     directory.create(tmp_path / "run", runs.small("ppo"), runs.QUIET)
     directory.create(tmp_path / "far", dataclasses.replace(runs.small("ppo"), gamma=0.99999), runs.QUIET)
+    pendulum = {"env": "gymnasium:Pendulum-v1", "env_version": None, "physics": "gymnasium"}
+    directory.create(tmp_path / "cut", dataclasses.replace(runs.small("ppo"), **pendulum), runs.QUIET)
     monkeypatch.setattr("sys.argv", ["dgae refit", *argv])
     with pytest.raises(SystemExit, match="2"):
         helpers.command("refit")()
