@@ -39,6 +39,11 @@ def stopped(why: str) -> int:
     return 130
 
 
+def flags_in(words: Sequence[str]) -> set[str]:
+    """The flags among the words of a command line, without their values."""
+    return {word.partition("=")[0].replace("_", "-") for word in words if word.startswith("--")}
+
+
 def peek(argv: Sequence[str], *names: str) -> dict[str, str | None]:
     """The values of some settings, looked at before the rest is parsed; None where there is none."""
     parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False, exit_on_error=False)

@@ -88,7 +88,7 @@ def _calibrate(arguments: Arguments, runs: dict[Path, Config]) -> int:
             result = calibration.calibrate(path, config, **how, watch=reporter.watch)
         found[path.resolve().name] = str(config.algo), result
         terminal.say(
-            f"{path.resolve().name}: {100 * result['coverage_90']:.0f} % of the returns in the central 90 %, "
+            f"{path.resolve().name}: {picture.held(result)}, "
             f"{100 * result['crossing']:.0f} % of neighbours cross, rmse {result['rmse']:.3f}, spread {result['spread']:.3f}"
         )
     out = arguments.out or files.beside(arguments.run_dirs[0], "calibration.png")

@@ -13,7 +13,7 @@ from typing import Annotated
 import tyro
 
 from dgae_jax.cli import train
-from dgae_jax.cli.arguments import fail, parse_known, stopped
+from dgae_jax.cli.arguments import fail, flags_in, parse_known, stopped
 from dgae_jax.configs.algorithms import TABLE
 from dgae_jax.configs.config import Config, ConfigError, invalid, lookup, task_spec
 from dgae_jax.envs.registry import TASKS
@@ -57,6 +57,8 @@ class Arguments:
     """Fraction of the preset's samples [1]."""
     seeds_per_run: int = 1
     """Seeds that are trained side by side in one program: 1 is the fastest on a CPU, more are meant for a GPU [runs]."""
+    inexact: bool = False
+    """Let cells go on that were begun with another device, number of cores or versions: the same in the statistical sense only."""
     launch: Annotated[LaunchOptions, tyro.conf.arg(name="")] = field(default_factory=LaunchOptions)
 
 
@@ -97,11 +99,11 @@ def _cells(arguments: Arguments, rest: list[str]) -> tuple[list[matrix.Cell], Ru
         raise invalid("scale", arguments.scale, "above 0 and at most 1")
     if not 1 <= arguments.seeds_per_run <= len(arguments.seeds):
         raise invalid("seeds_per_run", arguments.seeds_per_run, f"a whole number from 1 to the number of seeds, {len(arguments.seeds)}")
-    if arguments.scale != 1 and any(word.partition("=")[0].replace("_", "-") == "--total-steps" for word in rest):
+    if arguments.scale != 1 and "--total-steps" in flags_in(rest):
         raise invalid("scale", arguments.scale, "left out with --total-steps")
     if arguments.config and arguments.variants is None and len(arguments.algos) > 1:
         raise invalid("config", arguments.config, "used with one of --algos")
-    kinds = _kinds(arguments)
+    kinds = _kinds(arguments, rest)
     options = RunOptions()
 
     def make(task: str, kind: str) -> Config:
@@ -112,7 +114,8 @@ def _cells(arguments: Arguments, rest: list[str]) -> tuple[list[matrix.Cell], Ru
         _refuse(config, options, task, algo)
         return config if arguments.scale == 1 else _scaled(config, arguments.scale)
 
-    return matrix.matrix(arguments.envs, list(kinds), arguments.seeds, arguments.seeds_per_run, make), options
+    cells = matrix.matrix(arguments.envs, list(kinds), arguments.seeds, arguments.seeds_per_run, make)
+    return cells, dataclasses.replace(options, inexact=arguments.inexact)
 
 
 def _scaled(config: Config, scale: float) -> Config:
@@ -123,7 +126,7 @@ def _scaled(config: Config, scale: float) -> Config:
     return dataclasses.replace(config, total_steps=steps)
 
 
-def _kinds(arguments: Arguments) -> dict[str, str]:
+def _kinds(arguments: Arguments, rest: list[str]) -> dict[str, str]:
     """What is trained on each task by its name: an algorithm, and flags."""
     if arguments.variants is None:
         return {algo: algo for algo in arguments.algos}
@@ -131,7 +134,10 @@ def _kinds(arguments: Arguments) -> dict[str, str]:
         raise invalid("config", arguments.config, "left out with --variants, each of which has an algorithm of its own")
     if arguments.algos != Arguments.algos:
         raise invalid("algos", arguments.algos, "left out with --variants")
-    return lookup("variants", arguments.variants, VARIANTS)
+    kinds = lookup("variants", arguments.variants, VARIANTS)
+    for name in sorted(flags_in(rest) & flags_in(" ".join(kinds.values()).split())):
+        raise ConfigError(f"{name}: must be left out with --variants {arguments.variants}, which differ in it")
+    return kinds
 
 
 def _refuse(config: Config, options: RunOptions, task: str, algo: str) -> None:

@@ -10,7 +10,7 @@ from importlib.util import find_spec
 from pathlib import Path
 
 from dgae_jax.cli import train
-from dgae_jax.cli.arguments import fail, parse_known, stopped
+from dgae_jax.cli.arguments import fail, flags_in, parse_known, stopped
 from dgae_jax.configs.config import ConfigError, invalid
 from dgae_jax.run import terminal
 from dgae_jax.run.options import RunOptions
@@ -89,7 +89,7 @@ def main() -> int:
 def _tuning(argv: list[str]) -> Tuning:
     """What a command line means; raises ConfigError for the first argument that is invalid."""
     arguments, rest = parse_known(Arguments, PURPOSE, argv, EXAMPLES, NOTE, REST)
-    given = {word.partition("=")[0].replace("_", "-") for word in rest}
+    given = flags_in(rest)
     for why, names in LEFT_OUT.items():
         for name in given.intersection(names):
             raise ConfigError(f"{name}: must be {why}")

@@ -192,8 +192,7 @@ def resolve(config: Config) -> Config:
     """
     spec, config = task_spec(config), _fill(config, {"algo": "dppo"})
     row = lookup("algo", config.algo, TABLE)
-    version = spec.versions[0] if spec.versions else None
-    config = _fill(config, {"physics": spec.engines[0], "env_version": version, "residual": row.residual})
+    config = _fill(config, {"physics": spec.default_engine, "env_version": spec.default_version, "residual": row.residual})
     policy, critic = _fill(config.policy, {"update": row.policy_update}), _fill(config.critic, {"kind": row.critic, "target": row.target})
     policy = _fill(policy, lookup("policy.update", policy.update, UPDATES).options)
     critic = _fill(critic, {**DESCENT, **lookup("critic.kind", critic.kind, CRITICS).options})

@@ -31,7 +31,8 @@ def needed(config: Config, env: Env) -> int:
     rollout = FLOAT * samples * (4 * obs + 2 * actions + 3 * outputs + 16)  # transitions, the batch made of them, predictions
     networks = _network((obs, *config.policy.hidden, actions), samples, config.policy.minibatches)
     networks += _network((obs, *config.critic.hidden, outputs), samples, config.critic.minibatches)
-    residuals = FLOAT * outputs**2 * (samples // (config.critic.minibatches or 1))
+    at_once = 1 if config.critic.target == "lambda-return" or jax.default_backend() == "cpu" else outputs  # targets, `maths.transport`
+    residuals = FLOAT * outputs * at_once * (samples // (config.critic.minibatches or 1))
     return config.num_seeds * (2 * world * config.num_envs + rollout + networks + residuals)
 
 

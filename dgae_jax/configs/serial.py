@@ -46,13 +46,14 @@ def _check_types(settings: Any, prefix: str) -> None:
             _value(value, kind, prefix + name)
 
 
+def flat(values: dict[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Settings by their path, of plain data."""
+    nested = (flat(v, f"{prefix}{k}.") if isinstance(v, dict) else {prefix + k: v} for k, v in values.items())
+    return {path: value for each in nested for path, value in each.items()}
+
+
 def differences(one: Config, two: Config) -> dict[str, tuple[Any, Any]]:
     """The fields, by path, in which two configurations differ, with both values."""
-
-    def flat(values: dict[str, Any], prefix: str = "") -> dict[str, Any]:
-        nested = (flat(v, f"{prefix}{k}.") if isinstance(v, dict) else {prefix + k: v} for k, v in values.items())
-        return {path: value for each in nested for path, value in each.items()}
-
     ours, theirs = flat(to_dict(one)), flat(to_dict(two))
     return {path: (value, theirs[path]) for path, value in ours.items() if value != theirs[path]}
 

@@ -1,5 +1,6 @@
 """Calibration of critics: histograms of the probability integral transform."""
 
+import math
 from collections.abc import Mapping
 from typing import Any
 
@@ -10,6 +11,14 @@ from matplotlib.ticker import PercentFormatter
 
 from dgae_jax.report.figures import LOOK, PANEL
 from dgae_jax.report.style import FAINT, look
+
+
+def held(statistics: Mapping[str, Any]) -> str:
+    """How many of the returns the critic's central 90 % hold, in words."""
+    share = statistics["coverage_90"]
+    if math.isnan(share):
+        return "fewer than 10 quantiles have no central 90 %"
+    return f"{100 * share:.0f} % of the returns in the central 90 %"
 
 
 def histograms(found: Mapping[str, tuple[str, dict[str, Any]]]) -> Figure:
@@ -26,7 +35,7 @@ def histograms(found: Mapping[str, tuple[str, dict[str, Any]]]) -> Figure:
             edges = np.linspace(0, 1, len(shares) + 1)
             axes.bar(edges[:-1], shares, np.diff(edges), align="edge", color=look(algo).colour, edgecolor="white", linewidth=0.5)
             axes.axhline(1 / len(shares), color=FAINT, linestyle=":", label="calibrated")
-            title = f"{name}\n{100 * statistics['coverage_90']:.0f} % of the returns in the central 90 %"
+            title = f"{name}\n{held(statistics)}"
             axes.set(title=title, xlabel="share of the quantiles below the return that came", ylabel="returns")
             axes.yaxis.set_major_formatter(PercentFormatter(1, decimals=0))
         panels[0].legend()

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from dgae_jax.configs.algorithms import TABLE
+from dgae_jax.configs.serial import flat
 from dgae_jax.envs.registry import TASKS
 from dgae_jax.report import statistics
 from dgae_jax.report.results import Row
@@ -72,12 +73,6 @@ def by_task(groups: Iterable[Group]) -> dict[str, list[Group]]:
     for group in groups:
         out.setdefault(group.task, []).append(group)
     return out
-
-
-def flat(config: dict[str, Any], prefix: str = "") -> dict[str, Any]:
-    """Settings by their path."""
-    nested = (flat(v, f"{prefix}{k}.") if isinstance(v, dict) else {prefix + k: v} for k, v in config.items())
-    return {path: value for each in nested for path, value in each.items()}
 
 
 def shown(value: Any) -> str:

@@ -14,7 +14,7 @@ import numpy as np
 
 from dgae_jax.configs.algorithms import TABLE
 from dgae_jax.configs.config import ConfigError
-from dgae_jax.run import files
+from dgae_jax.run import files, terminal
 from dgae_jax.run.summary import mean_of_worst
 
 RESULTS = "results.jsonl"
@@ -127,7 +127,11 @@ def _planned(path: Path) -> tuple[str, ...] | None:
 def _rows(path: Path) -> tuple[Row, ...]:
     rows, end, seen = [], 0, set()
     for number, (data, after) in enumerate(files.whole_rows(path), start=1):
-        row, end = _row(data, f"{path} line {number}"), after
+        end = after
+        if _diverged(data):
+            terminal.warn(f"warning: {path} line {number}: left out, because the return of cell {data.get('cell')} is not finite")
+            continue
+        row = _row(data, f"{path} line {number}")
         if (row.cell, row.seed) in seen:
             raise ConfigError(f"{path} line {number}: cell {row.cell}, seed {row.seed} is there twice")
         seen.add((row.cell, row.seed))
@@ -135,6 +139,12 @@ def _rows(path: Path) -> tuple[Row, ...]:
     if b"\n" in path.read_bytes()[end:]:  # a last line without an end is still being written
         raise ConfigError(f"{path} line {len(rows) + 1}: must be an object in JSON")
     return tuple(rows)
+
+
+def _diverged(data: dict[str, Any]) -> bool:
+    """JSON has null for a return that is not finite."""
+    final = data.get("final")
+    return isinstance(final, dict) and final.get("return_mean", 0) is None
 
 
 def _is(*kinds: type) -> Callable[[Any], bool]:

@@ -3,8 +3,9 @@
 from collections.abc import Iterable, Sequence
 from typing import Any
 
+from dgae_jax.configs.serial import flat
 from dgae_jax.report import html
-from dgae_jax.report.groups import SEEDS, Group, flat, shown
+from dgae_jax.report.groups import SEEDS, Group, shown
 from dgae_jax.report.results import Row
 from dgae_jax.report.tables import NONE, Table
 

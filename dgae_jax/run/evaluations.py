@@ -41,9 +41,11 @@ class EvaluationsFile:
 
     @property
     def best(self) -> int | None:
-        """Steps of the best evaluation, by the mean over all runs; the later of equal ones."""
+        """Steps of the best evaluation, by the mean over all runs, of those in which none of them is missing; the later of equal ones."""
         steps, mean, _ = self.points().T
-        return max((int(at) for at in steps), key=lambda at: (mean[steps == at].mean(), at), default=None)
+        runs = Counter(steps)
+        whole = [int(at) for at in runs if runs[at] == max(runs.values())]
+        return max(whole, key=lambda at: (mean[steps == at].mean(), at), default=None)
 
 
 def _is_evaluation(row: dict[str, Any]) -> bool:

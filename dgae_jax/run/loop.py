@@ -33,7 +33,7 @@ def start(config: Config, options: RunOptions, heed: Heed = unheeded) -> Finishe
     Raises ConfigError before anything is written or compiled if the configuration or a path is invalid, RunError if the run
     ends early, and what `heed` raises at an evaluation.
     """
-    config, options = _prepared(config, options)
+    config, options = prepared(config, options)
     with hosts.writing(options.run_dir or directory.default_path(config)) as run_dir:
         directory.create(run_dir, config, options)
         with directory.locked(run_dir):
@@ -46,7 +46,7 @@ def go_on(config: Config, options: RunOptions, heed: Heed = unheeded) -> Finishe
     Raises as `start`; ConfigError also, naming both values, for a setting other than `total_steps` that differs from the run's,
     or for another machine or version; CheckpointError if no checkpoint can be loaded.
     """
-    config, options = _prepared(config, options)
+    config, options = prepared(config, options)
     assert options.resume is not None
     _compare(config, directory.read_config(options.resume), options.resume, options)
     with hosts.writing(options.resume) as run_dir, directory.locked(run_dir):
@@ -92,8 +92,8 @@ def _exit_code(work: Callable[[Config, RunOptions], Finished], config: Config, o
     return 0
 
 
-def _prepared(config: Config, options: RunOptions) -> tuple[Config, RunOptions]:
-    """Configuration and options in full, after a look at everything that can be seen before work begins."""
+def prepared(config: Config, options: RunOptions) -> tuple[Config, RunOptions]:
+    """Configuration and options in full, after a look at everything that can be seen before work begins; raises ConfigError."""
     config = validate(config)
     validate_options(options, config)
     devices = machine.use_devices(config, options)

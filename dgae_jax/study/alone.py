@@ -16,16 +16,18 @@ from dgae_jax.study.tuning import Tuning, quarter, value_of
 def train(tuning: Tuning, study: optuna.Study, trial: Trial) -> float:
     """The value of a trial.
 
-    Raises TrialPruned where its settings do not go together, break down or are worse than most, RunError if it was stopped.
+    Raises TrialPruned where its settings do not go together or with this machine, break down or are worse than most, RunError if it was
+    stopped.
     """
     try:
         config = tuning.config_of(trial.params)
+        every = quarter(config) * config.samples_per_iteration
+        here = tuning.directory / "trials" / f"{first_number(study, trial):04d}"
+        kept = {"checkpoint_every": every, "keep_checkpoints": 1, "num_processes": 1}
+        options = dataclasses.replace(tuning.options, run_dir=here, resume_or_start=True, inexact=True, **kept)
+        loop.prepared(config, options)
     except ConfigError as reason:
         raise optuna.TrialPruned(str(reason)) from reason
-    every = quarter(config) * config.samples_per_iteration
-    here = tuning.directory / "trials" / f"{first_number(study, trial):04d}"
-    kept = {"checkpoint_every": every, "keep_checkpoints": 1, "num_processes": 1}
-    options = dataclasses.replace(tuning.options, run_dir=here, resume_or_start=True, inexact=True, **kept)
 
     def heed(steps: int, result: dict) -> None:
         trial.report(value_of(result), steps // every)

@@ -27,7 +27,7 @@ class LaunchOptions:
     launcher: str = "local"
     """local (this machine), ray (a cluster) or slurm (an array of jobs)."""
     processes: int | None = None
-    """local: runs at a time, each with its share of the cores; by default one per core, one in all with a GPU [processes]."""
+    """local: runs at a time, each with as many of the cores; by default one per core, one in all with a GPU [processes]."""
     address: str | None = None
     """ray: HOST:PORT of the cluster's head, or auto; by default a cluster of this machine's own [address]."""
     cpus_per_run: int = 1
@@ -85,11 +85,14 @@ def _processes() -> int:
 
 
 def _shares(processes: int) -> list[list[int]]:
-    """The cores of this process divided between so many, each at least one; none is pinned where there is one process, or no pinning."""
+    """The cores of this process divided between so many, as many for each, because a cell goes on with the number that it was begun with;
+    at least one. None is pinned where there is one process, or no pinning.
+    """
     if processes == 1 or not hasattr(os, "sched_getaffinity"):
         return [[] for _ in range(processes)]
     ours = sorted(os.sched_getaffinity(0))
-    return [ours[i % len(ours) :: processes] for i in range(processes)]
+    each = max(1, len(ours) // processes)
+    return [[ours[(each * i + k) % len(ours)] for k in range(each)] for i in range(processes)]
 
 
 LAUNCHERS: dict[str, Launcher] = {"local": local, "ray": on_ray.launch, "slurm": on_slurm.launch}

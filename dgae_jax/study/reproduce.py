@@ -5,6 +5,7 @@ import time
 from collections.abc import Sequence
 from typing import Any
 
+import jax
 import numpy as np
 
 from dgae_jax.run import terminal
@@ -25,6 +26,7 @@ def reproduce(study: Study, cells: Sequence[Cell], options: RunOptions, launch: 
 
     0 all are done; 1 some failed; 128 + the signal if one came: the same call goes on. Raises ConfigError if the launcher cannot start.
     """
+    jax.config.update("jax_platforms", "cpu")  # accelerators are the cells': what is read here is small
     rows = results.of_study(study)
     results.write(study, rows)
     jobs = [Job(study, cell, options) for cell in cells if cell.name not in rows]
@@ -36,7 +38,7 @@ def reproduce(study: Study, cells: Sequence[Cell], options: RunOptions, launch: 
         launch(jobs) if jobs else contextlib.nullcontext({}) as tasks,
     ):
         waiting = dict(tasks)
-        while waiting and not signals.anywhere():
+        while waiting and not signals.received:
             for task in [task for task in waiting if task.done()]:
                 cell = waiting.pop(task).cell
                 if reason := _failure(study, cell, task):

@@ -16,6 +16,7 @@ from optuna.trial import FrozenTrial, Trial, TrialState
 
 from dgae_jax.configs.config import invalid
 from dgae_jax.configs.serial import differences, from_dict, to_dict
+from dgae_jax.run.engines import engine_of
 from dgae_jax.study.search import Choice, Range, values_of
 from dgae_jax.study.tuning import Tuning
 
@@ -27,6 +28,9 @@ WAIT = 60
 
 FACTS = "tuning"
 """The study's attribute that says what is tuned."""
+
+JUDGED = {"seeds": "tuning_seeds", "episodes": "episodes", "eval_engine": "eval_engine"}
+"""What of it trials are judged by, and the flags."""
 
 
 @contextlib.contextmanager
@@ -81,12 +85,18 @@ def open_study(tuning: Tuning, storage: RDBStorage, worker: int = 0) -> optuna.S
 
 def _agree(study: optuna.Study, tuning: Tuning) -> None:
     """Write what is tuned, or refuse another."""
-    ours = {"config": to_dict(tuning.config), "search": {path: str(each) for path, each in tuning.space.items()}, "seeds": tuning.seeds}
+    ours = {
+        "config": to_dict(tuning.config),
+        "search": {path: str(each) for path, each in tuning.space.items()},
+        "seeds": tuning.seeds,
+        "episodes": tuning.options.episodes,
+        "eval_engine": engine_of(tuning.config, tuning.options.eval_engine),
+    }
     theirs = study.user_attrs.get(FACTS)
     if theirs is None:
         study.set_user_attr(FACTS, ours)
         return
-    changed = {flag: (ours[name], theirs[name]) for flag, name in (("tuning_seeds", "seeds"),)}
+    changed = {flag: (ours[name], theirs.get(name, ours[name])) for name, flag in JUDGED.items()}
     changed |= {f"search {path}": (ours["search"].get(path), theirs["search"].get(path)) for path in {**ours["search"], **theirs["search"]}}
     changed |= differences(tuning.config, from_dict(theirs["config"]))
     for setting, (now, then) in changed.items():

@@ -10,8 +10,8 @@ from collections.abc import Sequence
 from multiprocessing.process import BaseProcess
 from pathlib import Path
 
-from dgae_jax.configs.config import invalid
-from dgae_jax.run import terminal
+from dgae_jax.configs.config import ConfigError, invalid
+from dgae_jax.run import files, terminal
 from dgae_jax.study.tuning import Tuning
 
 POLL = 0.5
@@ -53,7 +53,11 @@ def tune(tuning: Tuning) -> int:
         count = f"{len(finished(study))} of {tuning.trials} trials are finished; the same command goes on"
         terminal.say(f"stopped by {signals.name}: {count}" if told else f"stopped: {count}")
         return signals.exit_code if told else 1
-    return outcome.write(tuning, study)
+    try:
+        with files.turn(tuning.directory):
+            return outcome.write(tuning, study)
+    except OSError as reason:
+        raise ConfigError(f"{reason.filename}: must be a file that can be written ({reason.strerror})") from reason
 
 
 def start(tuning: Tuning) -> Sequence[BaseProcess]:

@@ -51,7 +51,8 @@ def write(tuning: Tuning, study: optuna.Study, best: list[FrozenTrial]) -> None:
     """`tuning.html` and the PNGs in it; `best` are the trials that got to their end, the best first."""
     cards = ""
     for picture in PICTURES:
-        if len(best) < picture.least or (picture is MAP and len(_pair(tuning)) < 2):
+        alike = len({trial.value for trial in best}) < 2  # nothing explains a spread of zero
+        if len(best) < picture.least or (alike and picture.least > 1) or (picture is MAP and len(_pair(tuning)) < 2):
             continue
         image, words = _png(lambda picture=picture: picture.draw(tuning, study)), html.escape(picture.words(tuning, study, best))
         files.replace(tuning.directory / f"{picture.name}.png", image)

@@ -39,7 +39,7 @@ def run(job: Job, cores: Sequence[int] = (), lifeline: int = subprocess.PIPE) ->
 
     It stops when the other end of `lifeline` is closed: by default, when this process ends.
     """
-    options = json.dumps({**to_dict(job.options), "cache_dir": job.options.cache_dir})
+    options = json.dumps({**to_dict(job.options), "cache_dir": job.options.cache_dir, "inexact": job.options.inexact})
     words = [sys.executable, "-m", __name__, str(job.study.path.absolute()), job.cell.name, options, *map(str, cores)]
     with job.study.log(job.cell).open("ab") as log:
         # a session of its own: Ctrl-C comes to whoever started it, who stops it
@@ -59,7 +59,8 @@ def main() -> int:
 
     study, chosen = matrix.read(Path(where)), json.loads(options)
     cell = next(each for each in study.cells if each.name == name)
-    how = {"run_dir": study.run_dir(cell), "resume_or_start": True, "num_processes": 1, "cache_dir": chosen["cache_dir"]}
+    how = {"run_dir": study.run_dir(cell), "resume_or_start": True, "num_processes": 1}
+    how |= {name: chosen[name] for name in ("cache_dir", "inexact")}
     return _train(cell.config, dataclasses.replace(from_dict(chosen), **how))
 
 

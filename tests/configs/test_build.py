@@ -78,6 +78,12 @@ def test_memory_counts_at_least_the_state_and_the_rollout():
     assert needed(dataclasses.replace(config, num_seeds=7), env) == 7 * needed(config, env)
 
 
+def test_a_cpu_lays_out_no_residuals():
+    few, many = (validate(dataclasses.replace(small("dppo"), critic=dg.CriticConfig(quantiles=k, minibatches=1))) for k in (1000, 2000))
+    env = make_task(few)
+    assert needed(many, env) < 3 * needed(few, env)  # not four times: a minibatch has K residuals at a time, and not K × K
+
+
 @pytest.mark.parametrize(
     ("change", "setting"),
     [

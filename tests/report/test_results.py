@@ -102,3 +102,12 @@ def test_a_field_that_is_missing_is_named(name, tmp_path):
     del data[name]
     (tmp_path / "results.jsonl").write_text(json.dumps(data) + "\n")
     assert refusal(tmp_path) == f"{tmp_path}/results.jsonl line 1: {name}: missing"
+
+
+def test_a_run_whose_return_is_not_finite_has_no_result_and_that_is_said(tmp_path, capsys):
+    diverged = row(seed=1, final={"engine": "jax", "return_mean": None, "returns": [None, 2.0]})
+    directory = study(tmp_path, [row(seed=0), diverged, row(seed=2)])
+    found = results.read(directory)
+    assert [each.seed for each in found.rows] == [0, 2]
+    assert found.missing == [diverged["cell"]]
+    assert f"results.jsonl line 2: left out, because the return of cell {diverged['cell']} is not finite" in capsys.readouterr().err

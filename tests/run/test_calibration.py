@@ -9,6 +9,7 @@ import pytest
 
 from dgae_jax.cli import calibrate
 from dgae_jax.maths.transport import quantile_midpoints
+from dgae_jax.report import calibration as picture
 from dgae_jax.run import calibration, directory, loop, outcomes
 from tests import helpers, runs
 
@@ -93,3 +94,8 @@ def test_the_command_writes_the_statistics_of_every_run_and_a_picture(tmp_path, 
     assert np.isfinite([*found["pit"], found["rmse"], found["crps"], *found["similar_means"].values()]).all()
     assert (tmp_path / "run" / "calibration.png").read_bytes().startswith(b"\x89PNG")
     assert "of the returns in the central 90 %" in capsys.readouterr().out
+
+
+def test_what_is_said_of_coverage_is_a_share_where_there_are_enough_quantiles():
+    assert picture.held({"coverage_90": 0.874}) == "87 % of the returns in the central 90 %"
+    assert picture.held(calibration.statistics(UNIFORM[..., :9], RETURNS)) == "fewer than 10 quantiles have no central 90 %"

@@ -42,3 +42,14 @@ def test_an_evaluation_that_is_none_is_passed_over(row, tmp_path):
     path = tmp_path / "evaluations.jsonl"
     files.append_rows(path, [EVALUATIONS[0], {**EVALUATIONS[1], **row} if row else {}])
     assert len(EvaluationsFile(path).rows) == 1
+
+
+def test_an_evaluation_in_which_a_seed_diverged_is_not_the_best_before_a_resume_or_after_it(tmp_path):
+    path = tmp_path / "evaluations.jsonl"
+    files.append_rows(path, EVALUATIONS[:4])
+    file = EvaluationsFile(path)
+    seeds = [{"seed": seed, "return_mean": mean, "return_std": 1.0, "returns": [mean]} for seed, mean in ((0, 99.0), (1, np.nan))]
+    file.append(300, {"seeds": seeds})
+    assert file.best == EvaluationsFile(path).best == 200
+    file.cut(1000, 2)
+    assert file.best == EvaluationsFile(path).best == 200

@@ -2,6 +2,8 @@
 
 import json
 import os
+import time
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
@@ -39,3 +41,18 @@ def test_numbers_that_are_not_finite_are_null_in_json_however_deep(tmp_path):
     files.append_rows(tmp_path / "a.jsonl", [data])
     for name in ("a.json", "a.jsonl"):
         assert json.loads((tmp_path / name).read_text()) == {"a": None, "b": [1.5, None, {"c": [None, None]}], "d": "NaN", "e": 1}
+
+
+def test_of_several_that_write_in_a_directory_each_has_its_turn(tmp_path):
+    inside, most = [], []
+
+    def work(_):
+        with files.turn(tmp_path):
+            inside.append(1)
+            most.append(len(inside))
+            time.sleep(0.01)
+            inside.pop()
+
+    with ThreadPoolExecutor(8) as pool:
+        list(pool.map(work, range(16)))
+    assert most == [1] * 16

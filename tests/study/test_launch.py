@@ -51,6 +51,9 @@ def test_what_slurm_is_told_is_written_as_name_and_value():
 
 def test_cores_are_divided_between_processes_and_shared_where_there_are_too_few(monkeypatch):
     monkeypatch.setattr(os, "sched_getaffinity", lambda _: {4, 5, 6}, raising=False)
-    assert launch._shares(2) == [[4, 6], [5]]
+    assert launch._shares(3) == [[4], [5], [6]]
+    assert launch._shares(2) == [[4], [5]]  # as many for each: a cell goes on with the number that it was begun with
     assert launch._shares(4) == [[4], [5], [6], [4]]
     assert launch._shares(1) == [[]]
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _: set(range(5)), raising=False)
+    assert launch._shares(2) == [[0, 1], [2, 3]]

@@ -93,6 +93,20 @@ def test_a_broken_cell_goes_on_from_its_checkpoint_and_a_failed_one_stops_no_oth
     assert studies.rows(study) == studies.rows(whole[0])[:3]
 
 
+def test_a_cell_that_was_begun_on_another_machine_goes_on_here_if_asked_to(study):
+    torn = study / "runs/hopper-ppo-0"
+    last(torn).unlink()
+    (torn / "evaluation.json").unlink()
+    manifest = json.loads((torn / "manifest.json").read_text())
+    (torn / "manifest.json").write_text(json.dumps({**manifest, "cores": 99}))
+    code, lines, _ = studies.finish(studies.start(study))
+    assert code == 1
+    assert any("hopper-ppo-0: ended with exit code 2: error: resume" in line and "or with --inexact" in line for line in lines)
+    code, _, errors = studies.finish(studies.start(study, "--inexact"))
+    assert (code, errors) == (0, "")
+    assert "warning: cores 1 (was 99)" in (study / "logs/hopper-ppo-0.log").read_text()
+
+
 def test_killed_in_the_middle_the_same_command_ends_with_the_same_results(whole, tmp_path):
     study = tmp_path / "killed"
     process = studies.start(study)

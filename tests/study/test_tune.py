@@ -2,7 +2,9 @@
 
 import csv
 import dataclasses
+import errno
 import json
+import os
 import signal
 import subprocess
 import sys
@@ -11,16 +13,16 @@ import warnings
 
 import optuna
 import pytest
-from optuna.trial import TrialState
+from optuna.trial import TrialState, create_trial
 
 from dgae_jax.cli.train import parsed
 from dgae_jax.configs.config import ConfigError
-from dgae_jax.run import directory, loop
+from dgae_jax.run import directory, files, loop, machine
 from dgae_jax.run.options import RunOptions
 from dgae_jax.run.signals import Signals
-from dgae_jax.study import side_by_side, tune, worker
+from dgae_jax.study import outcome, side_by_side, tune, worker
 from dgae_jax.study.search import space_of
-from dgae_jax.study.storage import open_storage, open_study, requeue
+from dgae_jax.study.storage import distributions, open_storage, open_study, requeue
 from dgae_jax.study.trials import finished, take
 from dgae_jax.study.tuning import Tuning, value_of
 from tests.helpers import ROOT, TINY, command
@@ -299,6 +301,36 @@ def test_values_that_do_not_go_together_count_as_a_trial_without_a_return(tmp_pa
     assert [path.name for path in (ours.directory / "trials").iterdir()] == ["0000"]
 
 
+def test_values_that_do_not_fit_the_machine_count_as_a_trial_without_a_return(tmp_path, monkeypatch):
+    ours = tuning(tmp_path / "study", "policy.hidden=4000x4000,4096x4096", trials=1)
+    _, study = opened(ours)
+    monkeypatch.setattr(machine, "memory", lambda: 2**26)
+    assert worker.serve(ours, 0) == 0
+    assert [(trial.state, trial.value) for trial in finished(study)] == [(TrialState.PRUNED, None)]
+
+
+def test_trials_that_are_all_worth_the_same_have_a_page_without_the_picture_of_their_spread(tmp_path):
+    ours = tuning(tmp_path / "study")
+    _, study = opened(ours)
+    for gamma in (0.91, 0.92, 0.93, 0.94):
+        study.add_trial(create_trial(params={"gamma": gamma, "lam": 0.9}, distributions=distributions(ours), value=0.0))
+    assert outcome.write(ours, study) == 0
+    assert {path.name for path in ours.directory.iterdir()} >= {"history.png", "tuning.html", "best.json"}
+    assert not (ours.directory / "importances.png").exists()
+
+
+def test_a_full_disk_at_the_end_is_one_line(tmp_path, monkeypatch):
+    def full(path, *_):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(path))
+
+    ours = tuning(tmp_path / "study", trials=1)
+    _, study = opened(ours)
+    study.add_trial(create_trial(params={"gamma": 0.91, "lam": 0.9}, distributions=distributions(ours), value=0.0))
+    monkeypatch.setattr(files, "replace", full)
+    with pytest.raises(ConfigError, match=r"trials\.csv: must be a file that can be written \(No space left on device\)"):
+        tune.tune(ours)
+
+
 def test_no_more_trials_are_taken_than_are_left(tmp_path):
     ours = tuning(tmp_path / "study", trials=3, side_by_side=2)
     _, study = opened(ours)
@@ -376,5 +408,11 @@ def test_a_study_of_something_else_is_refused_also_with_other_seeds(tmp_path):
     storage, _ = opened(ours)
     with pytest.raises(ConfigError, match="tuning_seeds 2: must be 1 as in the study study"):
         open_study(dataclasses.replace(ours, seeds=2), storage)
+    for changes, message in (
+        ({"episodes": 5}, "episodes 5: must be 1 as"),
+        ({"eval_engine": "native"}, "eval_engine native: must be gymnasium as"),
+    ):
+        with pytest.raises(ConfigError, match=message):
+            open_study(dataclasses.replace(ours, options=dataclasses.replace(OPTIONS, **changes)), storage)
     with pytest.raises(ConfigError, match="num_envs 8: must be 4 as in the study study"):
         open_study(dataclasses.replace(ours, config=dataclasses.replace(ours.config, num_envs=8)), storage)

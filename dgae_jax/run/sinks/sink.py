@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from dgae_jax.configs.config import Config
-from dgae_jax.configs.serial import to_dict
+from dgae_jax.configs.serial import flat, to_dict
 
 Row = dict[str, Any]
 """A row of `metrics.jsonl` or of `evaluations.jsonl`: `steps`, `seed`, and numbers by name, None where there is none."""
@@ -48,12 +48,7 @@ def name_of(place: Place, seed: int) -> str:
 
 def settings(config: Config, seed: int) -> dict[str, Any]:
     """What the run of one seed was configured by: values by path, those that are unset left out."""
-
-    def flat(values: dict[str, Any], prefix: str = "") -> dict[str, Any]:
-        parts = (flat(v, f"{prefix}{k}.") if isinstance(v, dict) else {prefix + k: v} for k, v in values.items())
-        return {path: value for part in parts for path, value in part.items() if value is not None}
-
-    return flat(to_dict(dataclasses.replace(config, seed=seed)))
+    return {path: value for path, value in flat(to_dict(dataclasses.replace(config, seed=seed))).items() if value is not None}
 
 
 def numbers(row: Row) -> dict[str, float]:
