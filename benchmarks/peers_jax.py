@@ -48,10 +48,7 @@ def brax(task: str, width: int, worlds: int, seconds: float) -> float:
     """One training step of Brax per call, without evaluations."""
     from brax.training.agents.ppo import networks, train
 
-    def replicated(tree: Any, devices: Any) -> Any:  # Brax 0.14 calls it, JAX 0.10 has it no more
-        return jax.tree.map(lambda x: jnp.stack([x] * len(devices)), tree)
-
-    jax.device_put_replicated = replicated
+    from dgae_jax.envs.brax import trainers
 
     class _Over(Exception):
         pass
@@ -66,7 +63,7 @@ def brax(task: str, width: int, worlds: int, seconds: float) -> float:
         networks.make_ppo_networks, policy_hidden_layer_sizes=(width, width), value_hidden_layer_sizes=(width, width), activation=jnp.tanh
     )
     iterations = 10_000
-    with contextlib.suppress(_Over):
+    with contextlib.suppress(_Over), trainers():
         train.train(
             dg.make_env(task), num_timesteps=iterations * SAMPLES, num_envs=worlds, episode_length=1000,
             unroll_length=SAMPLES // MINIBATCHES, batch_size=1, num_minibatches=MINIBATCHES,  # its minibatches are whole unrolls

@@ -11,7 +11,7 @@ from typing import Literal
 import tyro
 
 from dgae_jax.cli.arguments import fail, parse, stopped
-from dgae_jax.cli.source import check_index, check_seed
+from dgae_jax.cli.source import check_file, check_index, check_seed
 from dgae_jax.configs.config import Config, ConfigError, invalid, resolve
 from dgae_jax.configs.parts import is_distribution
 from dgae_jax.run import directory, files, terminal
@@ -50,15 +50,15 @@ def main() -> int:
     terminal.prepare()
     try:
         arguments = parse(Arguments, PURPOSE, examples=EXAMPLES)
-        return _calibrate(arguments, _checked(arguments))
+        return _calibrate(arguments, *_checked(arguments))
     except ConfigError as mistake:
         fail(mistake)
     except KeyboardInterrupt:
         return stopped("stopped by SIGINT")
 
 
-def _checked(arguments: Arguments) -> dict[Path, Config]:
-    """The runs; raises ConfigError for the first thing that is invalid."""
+def _checked(arguments: Arguments) -> tuple[dict[Path, Config], Path]:
+    """The runs, and the picture to write; raises ConfigError for the first thing that is invalid."""
     if not arguments.run_dirs:
         raise ConfigError("RUN_DIRS: must be one run directory or more (--help lists every flag)")
     names = [path.resolve().name for path in arguments.run_dirs]
@@ -70,18 +70,23 @@ def _checked(arguments: Arguments) -> dict[Path, Config]:
             raise ConfigError(f"{path}: must be a run with a value distribution, not {config.algo}")
         check_index(arguments.index, config, path)
     check_seed(arguments.seed)
-    if arguments.out and not (arguments.out.suffix == ".png" and arguments.out.absolute().parent.is_dir()):
-        raise invalid("out", arguments.out, "a file whose name ends in .png, in a directory that exists")
-    return runs
+    out = arguments.out or files.beside(arguments.run_dirs[0], "calibration.png")
+    if out.suffix != ".png":
+        raise invalid("out", out, "a file whose name ends in .png")
+    for file in (out, out.with_suffix(".json")):
+        check_file(file)
+    return runs, out
 
 
-def _calibrate(arguments: Arguments, runs: dict[Path, Config]) -> int:
+def _calibrate(arguments: Arguments, runs: dict[Path, Config], out: Path) -> int:
     from dgae_jax.report import calibration as picture
-    from dgae_jax.run import calibration, curve, machine
+    from dgae_jax.run import calibration, curve, machine, outcomes
     from dgae_jax.run.progress import Reporter
 
     machine.use_devices(next(iter(runs.values())), RunOptions(devices=1, num_processes=1))
     machine.use_cache(arguments.cache_dir)
+    for config in runs.values():
+        outcomes.check(config)
     found, how = {}, {"which": arguments.checkpoint, "index": arguments.index, "seed": arguments.seed}
     for path, config in runs.items():
         with Reporter() as reporter:
@@ -91,7 +96,6 @@ def _calibrate(arguments: Arguments, runs: dict[Path, Config]) -> int:
             f"{path.resolve().name}: {picture.held(result)}, "
             f"{100 * result['crossing']:.0f} % of neighbours cross, rmse {result['rmse']:.3f}, spread {result['spread']:.3f}"
         )
-    out = arguments.out or files.beside(arguments.run_dirs[0], "calibration.png")
     _write(out, lambda to: curve.save(picture.histograms(found), to))
     statistics = {name: result for name, (_, result) in found.items()}
     _write(out.with_suffix(".json"), lambda to: files.write_json(to, statistics))

@@ -136,7 +136,7 @@ def _kinds(arguments: Arguments, rest: list[str]) -> dict[str, str]:
         raise invalid("algos", arguments.algos, "left out with --variants")
     kinds = lookup("variants", arguments.variants, VARIANTS)
     for name in sorted(flags_in(rest) & flags_in(" ".join(kinds.values()).split())):
-        raise ConfigError(f"{name}: must be left out with --variants {arguments.variants}, which differ in it")
+        raise ConfigError(f"{name}: must be left out with --variants {arguments.variants}, whose variants set it")
     return kinds
 
 

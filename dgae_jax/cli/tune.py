@@ -83,7 +83,7 @@ def main() -> int:
     except ConfigError as mistake:
         fail(mistake)
     except KeyboardInterrupt:
-        return stopped("stopped by SIGINT before tuning began")
+        return stopped("stopped by SIGINT; the same command goes on")
 
 
 def _tuning(argv: list[str]) -> Tuning:
@@ -113,8 +113,12 @@ def _check(arguments: Arguments, options: RunOptions) -> None:
             raise invalid(name, value, f"a whole number from {low:,} to {high:,} ({reason})")
     if not arguments.search:
         raise ConfigError("--search: must name a setting, gamma=0.95:0.999 for one")
-    if arguments.side_by_side > 1 and options.devices not in (None, 1):
-        raise invalid("devices", options.devices, "left out with --side-by-side, whose program runs on one")
+    if arguments.side_by_side > 1:
+        if options.devices not in (None, 1):
+            raise invalid("devices", options.devices, "left out with --side-by-side, whose program runs on one")
+        for name in ("log", "debug_nonfinite"):
+            if value := getattr(options, name):
+                raise invalid(name, value, "left out with --side-by-side, whose trials have no run directories")
     if arguments.study is not None and not re.fullmatch(r"[^/\0]{1,200}", arguments.study.absolute().name):
         raise invalid("study", arguments.study, "a directory with a name of its own")
 

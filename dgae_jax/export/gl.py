@@ -12,7 +12,7 @@ from dgae_jax.configs.config import ConfigError
 
 VARIABLE = "MUJOCO_GL"
 
-CANDIDATES = ("egl", "osmesa")
+CANDIDATES = ("cgl",) if sys.platform == "darwin" else ("egl", "osmesa")
 """In this order: EGL draws on a GPU if there is one, OSMesa always on the CPU."""
 
 _TRIAL = "import mujoco; mujoco.Renderer(mujoco.MjModel.from_xml_string('<mujoco/>'), 16, 16).render()"

@@ -60,14 +60,18 @@ def _compared(contents: Sequence[Content]) -> str:
 
 
 def _summary(content: Content) -> str:
-    rows, missing = content.study.rows, content.study.missing
+    rows, diverged = content.study.rows, [f"seed {seed} of {cell}" for cell, seed in content.study.diverged]
     seeds, steps = len({row.seed for row in rows}), sorted({row.total_steps for row in rows})
     budget = f"{steps[0]:,}" if len(steps) == 1 else f"{steps[0]:,} to {steps[-1]:,}"
     counts = {"task": len(content.tasks), "algorithm": len({group.algo for group in content.groups}), "seed": seeds}
     told = ", ".join(counted(number, noun) for noun, number in counts.items())
     text = f"{counted(len(rows), 'trained run')}: {told}, {budget} environment steps each."
-    some = ", ".join(missing[:10]) + (f" and {len(missing) - 10} more" if len(missing) > 10 else "")
-    return text + (f" Cells without a result: {some}." if missing else "")
+    return text + _named("Cells without a result", content.study.missing) + _named("Left out, because their return is not finite", diverged)
+
+
+def _named(what: str, names: Sequence[str], most: int = 10) -> str:
+    some = ", ".join(names[:most]) + (f" and {len(names) - most} more" if len(names) > most else "")
+    return f" {what}: {some}." if names else ""
 
 
 def _returns(content: Content) -> str:

@@ -76,6 +76,8 @@ class Study:
     rows: tuple[Row, ...]
     planned: tuple[str, ...] | None
     """Names of the cells in study.json; None for a file of results alone."""
+    diverged: tuple[tuple[str, int], ...] = ()
+    """Cells and seeds without a row here, because their return is not finite."""
 
     @property
     def name(self) -> str:
@@ -90,7 +92,7 @@ class Study:
     @property
     def missing(self) -> list[str]:
         """Planned cells without a result."""
-        done = {row.cell for row in self.rows}
+        done = {row.cell for row in self.rows} | {cell for cell, _ in self.diverged}
         return [cell for cell in self.planned or () if cell not in done]
 
 
@@ -105,13 +107,13 @@ def read(path: Path) -> Study:
         file = path / RESULTS if path.is_dir() else path
         if not file.exists() and not (path / "study.json").exists():
             raise ConfigError(f"{path}: must be the directory of a study, with study.json and {RESULTS}")
-        rows = _rows(file) if file.exists() else ()
+        rows, diverged = _rows(file) if file.exists() else ((), ())
         planned = _planned(path / "study.json") if path.is_dir() else None
     except OSError as reason:
         raise ConfigError(f"{path}: must be a study that can be read ({reason.strerror})") from reason
     if not rows:
         raise ConfigError(f"{path}: must have results; {RESULTS} has none yet")
-    return Study(path, rows, planned)
+    return Study(path, rows, planned, diverged)
 
 
 def _planned(path: Path) -> tuple[str, ...] | None:
@@ -124,12 +126,15 @@ def _planned(path: Path) -> tuple[str, ...] | None:
         raise ConfigError(f"{path}: must be an object with the cells of the study") from None
 
 
-def _rows(path: Path) -> tuple[Row, ...]:
-    rows, end, seen = [], 0, set()
+def _rows(path: Path) -> tuple[tuple[Row, ...], tuple[tuple[str, int], ...]]:
+    """The rows, and the cells and seeds that diverged."""
+    rows, diverged, end, number, seen = [], [], 0, 0, set()
     for number, (data, after) in enumerate(files.whole_rows(path), start=1):
         end = after
         if _diverged(data):
-            terminal.warn(f"warning: {path} line {number}: left out, because the return of cell {data.get('cell')} is not finite")
+            cell, seed = (_field(data, name, f"{path} line {number}", *FIELDS[name]) for name in ("cell", "seed"))
+            terminal.warn(f"warning: {path} line {number}: left out, because the return of cell {cell}, seed {seed} is not finite")
+            diverged.append((cell, seed))
             continue
         row = _row(data, f"{path} line {number}")
         if (row.cell, row.seed) in seen:
@@ -137,8 +142,8 @@ def _rows(path: Path) -> tuple[Row, ...]:
         seen.add((row.cell, row.seed))
         rows.append(row)
     if b"\n" in path.read_bytes()[end:]:  # a last line without an end is still being written
-        raise ConfigError(f"{path} line {len(rows) + 1}: must be an object in JSON")
-    return tuple(rows)
+        raise ConfigError(f"{path} line {number + 1}: must be an object in JSON")
+    return tuple(rows), tuple(diverged)
 
 
 def _diverged(data: dict[str, Any]) -> bool:

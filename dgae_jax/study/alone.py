@@ -7,10 +7,16 @@ import optuna
 from optuna.trial import Trial
 
 from dgae_jax.configs.config import ConfigError
-from dgae_jax.run import loop
+from dgae_jax.run import loop, machine
 from dgae_jax.run.training import BrokeDownError
 from dgae_jax.study.storage import first_number
 from dgae_jax.study.tuning import Tuning, quarter, value_of
+
+
+def ready(tuning: Tuning) -> None:
+    """Look at the machine before trials are taken; raises ConfigError where none could be trained on it."""
+    machine.use_devices(tuning.config, dataclasses.replace(tuning.options, num_processes=1))
+    machine.use_cache(tuning.options.cache_dir)
 
 
 def train(tuning: Tuning, study: optuna.Study, trial: Trial) -> float:
@@ -25,7 +31,7 @@ def train(tuning: Tuning, study: optuna.Study, trial: Trial) -> float:
         here = tuning.directory / "trials" / f"{first_number(study, trial):04d}"
         kept = {"checkpoint_every": every, "keep_checkpoints": 1, "num_processes": 1}
         options = dataclasses.replace(tuning.options, run_dir=here, resume_or_start=True, inexact=True, **kept)
-        loop.prepared(config, options)
+        loop.prepared(config, options)  # `ready` has seen that it is not the machine that is at fault
     except ConfigError as reason:
         raise optuna.TrialPruned(str(reason)) from reason
 

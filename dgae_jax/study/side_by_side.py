@@ -1,5 +1,6 @@
 """Several trials in one compiled program: their settings are traced, so that one program trains them all at once."""
 
+import dataclasses
 import math
 from collections.abc import Callable
 from functools import partial
@@ -12,6 +13,7 @@ from optuna.trial import Trial
 
 from dgae_jax.configs.build import make_algorithm, make_task, make_train, make_trainer, policies_of, seed_keys
 from dgae_jax.configs.config import Config
+from dgae_jax.configs.memory import check_memory
 from dgae_jax.configs.serial import to_dict
 from dgae_jax.envs.base import Env
 from dgae_jax.learn.parallel import COMPILER_OPTIONS, over_seeds
@@ -45,6 +47,7 @@ def train(tuning: Tuning, study: optuna.Study, trials: list[Trial], signals: Sig
     machine.use_devices(configs[0], RunOptions(devices=1, num_processes=1))
     machine.use_cache(tuning.options.cache_dir)
     env, keys, settings = make_task(configs[0]), seed_keys(configs[0]), stacked(configs)
+    check_memory(dataclasses.replace(configs[0], num_seeds=len(configs) * tuning.seeds), env, machine.memory())
     init, step = make_trainer(env, 1).init, make_step(env)
     with signals.may_stop() as watch:
         compile_aside(init, configs[0], keys, watch=watch)

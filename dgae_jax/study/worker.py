@@ -24,6 +24,8 @@ POLL = 0.5
 def serve(tuning: Tuning, worker: int) -> int:
     """Work on a tuning: 0 when it is over, 130 / 143 when it was stopped, 1 when it cannot go on."""
     try:
+        if tuning.side_by_side == 1:
+            alone.ready(tuning)
         storage = open_storage(tuning)
         code = _serve(tuning, open_study(tuning, storage, worker), storage)
     except (ConfigError, RunError) as reason:

@@ -99,6 +99,9 @@ _BODY = "<worldbody><geom type='plane' size='1 1 1'/><body pos='0 0 1'>{}<geom s
             "more than one tree, colliding geoms other than",
         ),
         ("<option integrator='RK4'/>" + _BODY.format("<joint damping='1 2'/>"), "dof dampingpoly"),
+        ("<option integrator='RK4'/>" + _BODY.format("<joint/>").replace("size='.1'", "size='.1' friction='0 0 0'"), "contacts without"),
+        ("<option integrator='RK4'/>" + _BODY.format("<joint limited='true' range='0 50' margin='26'/>"), "joint limits with margins"),
+        ("<option integrator='RK4' density='1'/>" + _BODY.format("<joint/><body><site/></body>"), "bodies without mass in a fluid"),
     ],
 )
 def test_a_model_that_is_not_covered_is_refused_by_name(xml, reason):

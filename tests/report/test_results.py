@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from dgae_jax.configs.config import ConfigError
-from dgae_jax.report import results
+from dgae_jax.report import page, results
+from dgae_jax.report.groups import groups_of
 from tests.report.rows import row, study
 
 
@@ -109,5 +110,14 @@ def test_a_run_whose_return_is_not_finite_has_no_result_and_that_is_said(tmp_pat
     directory = study(tmp_path, [row(seed=0), diverged, row(seed=2)])
     found = results.read(directory)
     assert [each.seed for each in found.rows] == [0, 2]
-    assert found.missing == [diverged["cell"]]
-    assert f"results.jsonl line 2: left out, because the return of cell {diverged['cell']} is not finite" in capsys.readouterr().err
+    assert (found.diverged, found.missing) == (((diverged["cell"], 1),), [])
+    assert f"results.jsonl line 2: left out, because the return of cell {diverged['cell']}, seed 1 is not finite" in capsys.readouterr().err
+    content = page.Content(found, groups_of(found.rows), [])
+    assert f"Left out, because their return is not finite: seed 1 of {diverged['cell']}." in page._summary(content)
+
+
+def test_a_line_that_is_no_row_behind_one_that_is_left_out_is_named_by_its_number(tmp_path):
+    directory = study(tmp_path, [row(seed=0), row(seed=1, final={"engine": "jax", "return_mean": None, "returns": [None]})])
+    with (directory / "results.jsonl").open("a") as file:
+        file.write("nonsense\n")
+    assert refusal(directory).endswith("results.jsonl line 3: must be an object in JSON")

@@ -71,7 +71,7 @@ def test_the_critics_of_all_kinds_of_quantiles_can_be_compared(tmp_path):
     made = {kind: dataclasses.replace(plain, critic=dataclasses.replace(plain.critic, kind=kind)) for kind in kinds}
     for name, config in made.items():
         directory.create(tmp_path / name, config, runs.QUIET)
-    checked = calibrate._checked(calibrate.Arguments(tuple(tmp_path / name for name in made)))
+    checked, _ = calibrate._checked(calibrate.Arguments(tuple(tmp_path / name for name in made)))
     assert {path.name: config.critic.kind for path, config in checked.items()} == {name: name for name in made}
 
 

@@ -123,9 +123,12 @@ def test_every_variant_of_a_question_is_a_configuration_of_its_own():
         ("--variants risk --algos ppo", "algos ppo: must be left out with --variants"),
         (
             "--variants calibration --critic.target bellman",
-            "--critic.target: must be left out with --variants calibration, which differ in it",
+            "--critic.target: must be left out with --variants calibration",
         ),
-        ("--variants attribution --critic.kappa=0.5", "--critic.kappa: must be left out with --variants attribution, which differ in it"),
+        (
+            "--variants attribution --critic.kappa=0.5",
+            "--critic.kappa: must be left out with --variants attribution, whose variants set it",
+        ),
         ("--variants risk --config best.json", "config best.json: must be left out with --variants"),
     ],
 )

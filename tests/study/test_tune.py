@@ -309,6 +309,14 @@ def test_values_that_do_not_fit_the_machine_count_as_a_trial_without_a_return(tm
     assert [(trial.state, trial.value) for trial in finished(study)] == [(TrialState.PRUNED, None)]
 
 
+def test_a_machine_on_which_nothing_can_be_trained_takes_no_trial(tmp_path, capsys):
+    ours = tuning(tmp_path / "study", options=dataclasses.replace(OPTIONS, cache_dir="/dev/null/below"))
+    _, study = opened(ours)
+    assert worker.serve(ours, 0) == 1
+    assert "stopped: cache_dir /dev/null/below: must be a directory that can be written" in capsys.readouterr().err
+    assert [trial.state for trial in study.trials] == [TrialState.WAITING]
+
+
 def test_trials_that_are_all_worth_the_same_have_a_page_without_the_picture_of_their_spread(tmp_path):
     ours = tuning(tmp_path / "study")
     _, study = opened(ours)
