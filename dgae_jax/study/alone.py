@@ -15,7 +15,8 @@ from dgae_jax.study.tuning import Tuning, quarter, value_of
 
 def ready(tuning: Tuning) -> None:
     """Look at the machine before trials are taken; raises ConfigError where none could be trained on it."""
-    machine.use_devices(tuning.config, dataclasses.replace(tuning.options, num_processes=1))
+    config = dataclasses.replace(tuning.config, num_seeds=tuning.seeds)
+    machine.use_devices(config, dataclasses.replace(tuning.options, num_processes=1))
     machine.use_cache(tuning.options.cache_dir)
 
 
