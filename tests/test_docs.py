@@ -68,7 +68,6 @@ def test_a_table_of_measurements_is_what_its_command_prints(path):
         ("docs/decisions.md", "ordered", ["returns"]),
         ("docs/decisions.md", "ordered-again", ["returns"]),
         ("docs/reproduction.md", "paper", ["returns", "improvement"]),
-        ("docs/reproduction.md", "paper-ant", ["returns"]),
         ("docs/reproduction.md", "paper-one-step", ["returns"]),
         ("docs/attribution.md", "attribution", ["attribution", "attribution-over-tasks"]),
         ("docs/risk.md", "risk", ["risk"]),
