@@ -233,9 +233,11 @@ def test_a_command_that_leaves_a_compiler_to_itself_ends_before_that_aborts_it(m
     codes, idle = [], threading.Event()
     monkeypatch.setattr(os, "_exit", codes.append)
     assert (arguments.stopped("stopped"), codes) == (130, [])
-    threading.Thread(target=idle.wait, name=compiling.THREAD, daemon=True).start()
+    left = threading.Thread(target=idle.wait, name=compiling.THREAD, daemon=True)
+    left.start()
     arguments.stopped("stopped")
     idle.set()
+    left.join()  # where it still ran, the next command to be stopped would end this process
     assert codes == [130]
     assert capsys.readouterr().err == "stopped\nstopped\n"
 
