@@ -93,7 +93,7 @@ def test_the_command_writes_the_statistics_of_every_run_and_a_picture(tmp_path, 
     assert found["samples"] == calibration.WORLDS * outcomes.CHUNK  # episodes of 20 steps, in whole chunks
     assert np.isfinite([*found["pit"], found["rmse"], found["crps"], *found["similar_means"].values()]).all()
     assert (tmp_path / "run" / "calibration.png").read_bytes().startswith(b"\x89PNG")
-    assert "of the returns in the central 90 %" in capsys.readouterr().out
+    assert "run: fewer than 10 quantiles have no central 90 %, " in capsys.readouterr().out
 
 
 def test_what_is_said_of_coverage_is_a_share_where_there_are_enough_quantiles():
