@@ -41,7 +41,7 @@ def stopped(why: str) -> int:
 
 def flags_in(words: Sequence[str]) -> set[str]:
     """The flags among the words of a command line, without their values."""
-    return {word.partition("=")[0].replace("_", "-") for word in words if word.startswith("--")}
+    return {mistakes.flag_of(word) for word in words if word.startswith("--")}
 
 
 def peek(argv: Sequence[str], *names: str) -> dict[str, str | None]:

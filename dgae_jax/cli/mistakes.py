@@ -45,19 +45,20 @@ def names(listed: Sequence[Leaf]) -> list[str]:
 def unknown(argv: Sequence[str], listed: Sequence[Leaf]) -> str | None:
     """The first word that looks like a flag and is none."""
     known = names(listed)
-    return next((word for word in argv if word.startswith("--") and word != "--" and _flag(word) not in known), None)
+    return next((word for word in argv if word.startswith("--") and word != "--" and flag_of(word) not in known), None)
 
 
 def not_a_flag(word: str, listed: Sequence[Leaf]) -> str:
     """That there is no such flag, and which may be meant."""
     known = names(listed)
-    near = get_close_matches(_flag(word), known, n=2, cutoff=0.75)
-    near = near or [name for name in known if name.endswith("." + _flag(word)[2:])]
+    near = get_close_matches(flag_of(word), known, n=2, cutoff=0.75)
+    near = near or [name for name in known if name.endswith("." + flag_of(word)[2:])]
     perhaps = f"; perhaps {' or '.join(near)}" if near else ""
     return f"{word}: is not a flag of this command{perhaps} (--help lists every flag)"
 
 
-def _flag(word: str) -> str:
+def flag_of(word: str) -> str:
+    """The flag in a word of a command line, without its value."""
     return word.partition("=")[0].replace("_", "-")
 
 
@@ -67,8 +68,8 @@ def _upper(name: str) -> str:
 
 def _stray(word: str, by_flag: dict[str, Leaf], argv: Sequence[str]) -> str:
     """A word too many."""
-    before = next((_flag(flag) for flag, after in pairwise(argv) if after == word), None)
-    before = before or next((_flag(each) for each in argv if each.endswith("=" + word)), "")
+    before = next((flag_of(flag) for flag, after in pairwise(argv) if after == word), None)
+    before = before or next((flag_of(each) for each in argv if each.endswith("=" + word)), "")
     leaf = by_flag.get(before.replace("--no-", "--"))
     if leaf and leaf.hint is bool:
         return f"{before} {word}: takes no value; it is --{leaf.flag} or --no-{leaf.flag}"
@@ -77,7 +78,7 @@ def _stray(word: str, by_flag: dict[str, Leaf], argv: Sequence[str]) -> str:
 
 def _values(flag: str, argv: Sequence[str]) -> Iterator[str]:
     """What was written behind a flag, the last time."""
-    for at in [at for at, word in enumerate(argv) if _flag(word) == flag][-1:]:
+    for at in [at for at, word in enumerate(argv) if flag_of(word) == flag][-1:]:
         if "=" in argv[at]:
             yield argv[at].partition("=")[2]
         yield from (word for word in _until_a_flag(argv[at + 1 :]))

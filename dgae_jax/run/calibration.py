@@ -34,7 +34,6 @@ def calibrate(source: Path, config: Config, *, which: str, index: int = 0, seed:
     parts of probability, `similar_means` the shares of steps whose target and prediction have similar means for their shapes
     (`similar`). Raises as `outcomes.play`, `restore.trained` and `restore.reward_std`.
     """
-    outcomes.check(config)
     found = restore.trained(source, config, which)
     policy, critic = jax.tree.map(lambda x: x[index], (found.policy, found.critic))
     std = float(restore.reward_std(found.path, config)[index])

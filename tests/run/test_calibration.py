@@ -65,6 +65,24 @@ def test_what_cannot_be_compared_is_refused_in_one_line(changes, message, tmp_pa
     assert message in capsys.readouterr().err
 
 
+@pytest.mark.parametrize(
+    ("out", "message"),
+    [
+        ("x.pdf", "--out x.pdf: must be a file whose name ends in .png"),
+        ("there/x.png", "--out there/x.png: must be a file in a directory that exists"),
+        ("taken.png", "--out taken.json: must be a file, not a directory, a link or a device"),  # where the statistics would go
+    ],
+)
+def test_a_picture_that_cannot_be_written_is_refused_before_anything_is_played(out, message, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "taken.json").mkdir()
+    directory.create(tmp_path / "run", runs.small("dppo"), runs.QUIET)
+    monkeypatch.setattr("sys.argv", ["dgae calibrate", "run", "--out", out])
+    with pytest.raises(SystemExit, match="2"):
+        helpers.command("calibrate")()
+    assert message in capsys.readouterr().err
+
+
 def test_the_critics_of_all_kinds_of_quantiles_can_be_compared(tmp_path):
     plain = runs.small("dppo")
     kinds = ("quantile", "sorted", "ordered")
