@@ -124,3 +124,10 @@ def test_a_committed_policy_is_there_for_every_result_and_knows_its_configuratio
     for row in results.read(ROOT / "results" / "tuned").rows:
         config = to_dict(directory.config_of(ROOT / "results" / "tuned" / "policies" / f"{row.cell}.msgpack"))
         assert json.loads(json.dumps(config)) == row.config
+
+
+@pytest.mark.parametrize("study", sorted((ROOT / "results").iterdir()), ids=lambda study: study.name)
+def test_a_committed_result_names_a_command_that_writes_into_the_results(study):
+    rows = [json.loads(line)["command"] for line in (study / "results.jsonl").read_text().splitlines()]
+    cells = json.loads((study / "study.json").read_text())["commands"].values()
+    assert all(command.startswith("dgae reproduce results/") for command in [*rows, *cells])
