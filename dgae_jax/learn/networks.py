@@ -44,10 +44,11 @@ class Value(nn.Module):
     hidden: Sequence[int]
     outputs: int
     torso: Callable[[Sequence[int]], nn.Module] = Torso
+    bias: ArrayLike = 0.0
 
     @nn.compact
     def __call__(self, obs: Float[Array, "*batch O"]) -> Float[Array, "*batch K"]:
-        return _dense(self.outputs, 1.0)(self.torso(self.hidden)(obs))
+        return _dense(self.outputs, 1.0, self.bias)(self.torso(self.hidden)(obs))
 
 
 class SharedCovariance(nn.Module):
@@ -91,7 +92,9 @@ def gaussian_policy(
     return Policy(lambda key: module.init(key, jnp.zeros(obs_size)), module.apply)
 
 
-def value_network(obs_size: int, outputs: int, *, hidden: Sequence[int], torso: Callable[[Sequence[int]], nn.Module] = Torso) -> Network:
-    """A head of `outputs` numbers: one scalar, or K quantiles (Sec. results, set-up)."""
-    module = Value(tuple(hidden), outputs, torso)
+def value_network(
+    obs_size: int, outputs: int, *, hidden: Sequence[int], torso: Callable[[Sequence[int]], nn.Module] = Torso, bias: ArrayLike = 0.0
+) -> Network:
+    """A head of `outputs` numbers, one scalar or K quantiles (Sec. results, set-up), whose biases begin at `bias`."""
+    module = Value(tuple(hidden), outputs, torso, bias)
     return Network(lambda key: module.init(key, jnp.zeros(obs_size)), module.apply)

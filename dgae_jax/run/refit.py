@@ -4,6 +4,7 @@ Nothing is bootstrapped and no policy depends on it, so what it holds of the ret
 """
 
 import dataclasses
+from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -16,7 +17,7 @@ from dgae_jax.learn.networks import Network, value_network
 from dgae_jax.learn.normalizers import normalize
 from dgae_jax.learn.types import Fit, Fitted, Params
 from dgae_jax.learn.updates import adam, descend
-from dgae_jax.maths.transport import quantile_huber_loss
+from dgae_jax.maths.transport import quantile_huber_loss, quantile_midpoints
 from dgae_jax.run import outcomes, restore
 from dgae_jax.run.compiling import Watch, compile_aside, unwatched
 from dgae_jax.run.restore import Trained
@@ -64,7 +65,7 @@ def refit(
     std = jnp.where(spread > 0, spread, 1.0)
     samples = Samples(normalize(policy.observations, came.obs).reshape(came.outcome.size, -1), (came.outcome / std).ravel())
     config = _of_one(config, index)
-    network = value_network(samples.obs.shape[-1], int(config.critic.quantiles or 0), hidden=config.critic.hidden)
+    network = begun(samples, int(config.critic.quantiles or 0), config.critic.hidden)
     params = fitted(network, samples, len(came.outcome), fit_key, watch)
     policy, critic = jax.tree.map(lambda x: x[None], (policy, Fitted(params, policy.observations)))
     return Refitted(config, Trained(policy, critic, found.path), std[None], came.outcome.size)
@@ -74,6 +75,12 @@ def _of_one(config: Config, index: int) -> Config:
     """The configuration of the run with that index alone, and of a `sorted` critic of rewards that are scaled."""
     critic = CriticConfig(kind="sorted", hidden=config.critic.hidden, quantiles=config.critic.quantiles, target=config.critic.target)
     return resolve(dataclasses.replace(config, seed=config.seed + index, num_seeds=1, normalize_rewards=True, critic=critic))
+
+
+def begun(samples: Samples, quantiles: int, hidden: Sequence[int]) -> Network:
+    """A network that begins near the quantiles of all samples: with γ near 1 they are far from 0 beside their spread."""
+    bias = jnp.quantile(samples.outcome, quantile_midpoints(quantiles))
+    return value_network(samples.obs.shape[-1], quantiles, hidden=hidden, bias=bias)
 
 
 def fitted(network: Network, samples: Samples, minibatches: int, key: Key[Array, ""], watch: Watch = unwatched) -> Params:

@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 
 import dgae_jax as dg
-from dgae_jax.learn.networks import value_network
 from dgae_jax.maths.transport import quantile_midpoints
 from dgae_jax.run import directory, loop, outcomes, refit, restore
 from tests import helpers, runs
@@ -19,30 +18,28 @@ POLICY = helpers.ROOT / "results" / "tuned" / "policies" / "hopper-dppo-1.msgpac
 """Of the table of results, from before such files said what rewards were divided by."""
 
 
-@pytest.fixture(scope="module")
-def network():
-    return value_network(1, 16, hidden=(32,))
-
-
-def quantiles_after(network, obs, outcome):
-    params = refit.fitted(network, refit.Samples(obs[:, None], outcome), 200, jax.random.key(2))
+def quantiles_after(obs, outcome):
+    samples = refit.Samples(obs[:, None], outcome)
+    network = refit.begun(samples, 16, hidden=(32,))
+    params = refit.fitted(network, samples, 200, jax.random.key(2))
     return network.apply(params, jnp.array([[-1.0], [1.0]]))
 
 
-def test_quantiles_of_returns_that_are_uniform_up_to_a_bound_are_midpoints_times_it(network):
-    # F⁻¹(τ) = cτ of a uniform variable on 0 … c; here c is 1 in one state, 3 in the other
+@pytest.mark.parametrize("lowest", [0.0, -1_500.0, 1_500.0], ids="{:+.0f}".format)
+def test_quantiles_of_returns_that_are_uniform_above_a_bound_are_that_and_midpoints_times_their_range(lowest):
+    # F⁻¹(τ) = l + cτ of a uniform variable on l … l + c; here c is 1 in one state, 3 in the other
     which, height = (jax.random.uniform(jax.random.key(i), (20_000,)) for i in range(2))
     obs = jnp.where(which < 0.5, -1.0, 1.0)
-    found = quantiles_after(network, obs, height * (2 + obs))
-    expected = jnp.array([[1.0], [3.0]]) * quantile_midpoints(16)
+    found = quantiles_after(obs, lowest + height * (2 + obs))
+    expected = lowest + jnp.array([[1.0], [3.0]]) * quantile_midpoints(16)
     np.testing.assert_allclose(found, expected, atol=0.06)
 
 
-def test_a_return_that_is_lost_one_time_in_four_is_lost_in_one_quantile_in_four(network):
+def test_a_return_that_is_lost_one_time_in_four_is_lost_in_one_quantile_in_four():
     # one state pays 1, the other 1 with probability ¾ and else 0: F⁻¹ is 0 up to ¼ and 1 beyond
     which, luck = (jax.random.uniform(jax.random.key(i), (20_000,)) for i in range(2))
     obs = jnp.where(which < 0.5, -1.0, 1.0)
-    found = quantiles_after(network, obs, jnp.where((obs > 0) & (luck < 0.25), 0.0, 1.0))
+    found = quantiles_after(obs, jnp.where((obs > 0) & (luck < 0.25), 0.0, 1.0))
     assert np.abs(found[0] - 1).max() < 0.1
     np.testing.assert_allclose(found[1], [0.0] * 4 + [1.0] * 12, atol=0.15)
 
