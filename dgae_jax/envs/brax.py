@@ -12,6 +12,8 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
+from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jaxtyping import Array, Float
 
 from dgae_jax.envs.base import Env, Wrapper, brax
@@ -52,8 +54,9 @@ def trainers() -> Iterator[None]:
 
 
 def _replicated(tree: Any, devices: Sequence[Any]) -> Any:
-    """A copy for each device along a new first axis, which `jax.pmap` divides."""
-    return jax.tree.map(lambda x: jnp.stack([x] * len(devices)), tree)
+    """A copy on each device, along a new first axis."""
+    divided = NamedSharding(Mesh(np.array(devices), ("devices",)), PartitionSpec("devices"))
+    return jax.tree.map(lambda x: jax.device_put(jnp.stack([x] * len(devices)), divided), tree)
 
 
 for _name in TASKS:

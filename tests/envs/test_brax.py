@@ -1,5 +1,9 @@
 """Our tasks under Brax's wrappers and trainers."""
 
+import os
+import subprocess
+import sys
+
 import brax.envs
 import jax
 import jax.numpy as jnp
@@ -11,6 +15,7 @@ from brax.training.agents.ppo.losses import compute_gae
 from numpy.testing import assert_allclose, assert_array_equal
 
 from dgae_jax.envs.brax import trainers
+from tests.helpers import ROOT
 
 LENGTH = 12
 
@@ -57,6 +62,19 @@ def test_braxs_trainers_find_what_jax_took_away_only_inside():
     with trainers():
         assert jax.device_put_replicated({"a": jnp.arange(3)}, jax.devices()[:1])["a"].tolist() == [[0, 1, 2]]
     assert not hasattr(jax, "device_put_replicated")
+
+
+def test_what_braxs_trainers_copy_to_two_devices_lies_on_both():
+    program = """
+import jax
+from dgae_jax.envs.brax import trainers
+with trainers():
+    copies = jax.device_put_replicated({"a": jax.numpy.arange(3)}, jax.devices())["a"]
+print([(shard.device.id, shard.data.tolist()) for shard in copies.addressable_shards])
+"""
+    two = {**os.environ, "JAX_PLATFORMS": "cpu", "JAX_NUM_CPU_DEVICES": "2"}
+    done = subprocess.run([sys.executable, "-c", program], cwd=ROOT, env=two, capture_output=True, text=True, check=True)
+    assert done.stdout == "[(0, [[0, 1, 2]]), (1, [[0, 1, 2]])]\n"
 
 
 @pytest.mark.slow
