@@ -14,7 +14,7 @@ from typing import Any, get_args, get_origin, get_type_hints
 from dgae_jax.configs.config import Config, ConfigError, CriticConfig, PolicyConfig, floats_of, invalid
 from dgae_jax.configs.validation import validate
 
-USUAL = ("gamma=0.95:0.9999", "lam=0.8:1")
+USUAL = ("gamma=0.95:0.9999", "lam=0.5:1")
 """What the paper tuned for each method."""
 
 SAME_FOR_ALL = ("env", "env_version", "algo", "physics", "seed", "num_seeds", "total_steps", "episode_length")

@@ -4,7 +4,9 @@ import dataclasses
 
 import pytest
 
+from dgae_jax.configs.algorithms import TABLE
 from dgae_jax.configs.config import Config, ConfigError, CriticConfig, PolicyConfig
+from dgae_jax.configs.presets import preset
 from dgae_jax.configs.validation import validate
 from dgae_jax.study.search import USUAL, Choice, Range, is_traced, space_of, values_of, with_values
 
@@ -49,8 +51,8 @@ def test_values_take_their_place_in_the_configuration_and_are_read_from_it():
 
 def test_the_usual_search_holds_the_values_that_every_preset_starts_from():
     space = space_of(USUAL, PPO)
-    for gamma in (0.99, 0.9999):  # all tasks, and swimmer
-        assert all(value in space[path] for path, value in {"gamma": gamma, "lam": 0.95}.items())
+    for config in (preset("tuned", algo, env) for algo in TABLE for env in ("ant", "hopper", "swimmer", "walker2d")):
+        assert all(value in space[path] for path, value in values_of(config, space).items())
 
 
 def test_what_one_program_serves_are_the_numbers_that_are_leaves_of_the_configuration():
