@@ -58,6 +58,8 @@ def test_the_usual_search_holds_the_values_that_every_preset_starts_from():
 def test_what_one_program_serves_are_the_numbers_that_are_leaves_of_the_configuration():
     import jax
 
+    import dgae_jax.configs.pytree  # noqa: F401  (registers the parts)
+
     leaves = jax.tree_util.tree_flatten_with_path(Config(policy=PolicyConfig(clip=0.2), critic=CriticConfig(kappa=1.0)))[0]
     named = {jax.tree_util.keystr(at, simple=True, separator=".") for at, _ in leaves} - {"total_steps"}
     assert named >= {"gamma", "lam", "policy.clip", "critic.kappa"}
