@@ -66,6 +66,7 @@ def test_a_table_of_measurements_is_what_its_command_prints(path):
         ("docs/results.md", "long", ["returns", "improvement"]),
         ("docs/results.md", "swimmer-099", ["returns"]),
         ("docs/decisions.md", "ant-lambda-095", ["returns"]),
+        ("docs/decisions.md", "swimmer-lambda-098", ["returns"]),
         ("docs/decisions.md", "ordered", ["returns"]),
         ("docs/decisions.md", "ordered-again", ["returns"]),
         ("docs/reproduction.md", "paper", ["returns", "improvement"]),
