@@ -92,7 +92,7 @@ def fastest(f: Callable[[], Any], seconds: float) -> float:
 
 
 def setting(task: str, algo: str, physics: str, width: int) -> Config:
-    """An algorithm as it is on Walker2d, on any task, with networks as wide as asked for; A2C takes one step per rollout of 8, as its peer."""
+    """An algorithm as on Walker2d, on any task, with networks as wide as asked for; A2C takes one step per rollout of 8, as its peer."""
     config = dataclasses.replace(dg.preset("tuned", algo, "walker2d"), env=task)
     as_peer = PEER_OF[algo] == "A2C"
     steps = {"optimizer": "rmsprop", "epochs": 1, "minibatches": 1} if as_peer else {}
