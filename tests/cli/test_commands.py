@@ -173,7 +173,7 @@ def test_a_used_run_directory_is_refused_and_left_alone(trained, run):
         (["--config", "FILE", "--algo", "ppo"], r"--algo ppo: must be dppo as in FILE, or left out"),
         (["--config", "FILE", "--preset", "paper"], r"--preset paper: must be left out: all settings start from FILE"),
         (["--resume", "RUN", "--run-dir", "there"], r"--run-dir there: must be left out: --resume writes to RUN"),
-        (["--resume", "RUN", "--gamma", "0.5"], r"--gamma 0\.5: must be 0\.99 as in RUN, or left out"),
+        (["--resume", "RUN", "--gamma", "0.5"], r"--gamma 0\.5: must be 0\.995 as in RUN, or left out"),
     ],
 )
 def test_flags_that_would_have_no_effect_are_refused(argv, message, trained, run, monkeypatch, tmp_path):

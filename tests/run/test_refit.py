@@ -11,11 +11,11 @@ import pytest
 
 import dgae_jax as dg
 from dgae_jax.maths.transport import quantile_midpoints
-from dgae_jax.run import directory, loop, outcomes, refit, restore
+from dgae_jax.run import checkpoint, directory, loop, outcomes, refit, restore
 from tests import helpers, runs
 
 POLICY = helpers.ROOT / "results" / "tuned" / "policies" / "hopper-dppo-1.msgpack"
-"""Of the table of results, from before such files said what rewards were divided by."""
+"""Of the table of results."""
 
 
 def quantiles_after(obs, outcome):
@@ -122,7 +122,11 @@ def test_a_policy_is_not_written_over_by_its_own_refit(tmp_path, monkeypatch, ca
 
 
 def test_a_file_without_the_scale_of_its_rewards_is_not_compared_with_returns(monkeypatch, capsys, tmp_path):
-    monkeypatch.setattr("sys.argv", ["dgae calibrate", str(POLICY), "--out", str(tmp_path / "x.png")])
+    config, file = directory.config_of(POLICY), tmp_path / "old.msgpack"
+    policy, critic, _ = restore.trained(POLICY, config, "newest")
+    networks = {"policy": {"params": policy.params}, "critic": {"params": critic.params}, "observations": policy.observations}
+    checkpoint.write(file, config, checkpoint.arrays_of(networks))
+    monkeypatch.setattr("sys.argv", ["dgae calibrate", str(file), "--out", str(tmp_path / "x.png")])
     with pytest.raises(SystemExit, match="2"):
         helpers.command("calibrate")()
-    assert capsys.readouterr().err == f"error: {POLICY}: does not say what rewards were divided by; dgae refit fits a critic that does\n"
+    assert capsys.readouterr().err == f"error: {file}: does not say what rewards were divided by; dgae refit fits a critic that does\n"
