@@ -103,6 +103,12 @@ def test_the_coverage_of_critics_with_monte_carlo_targets_is_what_the_files_say(
         assert f"| `{run}` | {returns[run]:,.0f} | {100 * statistics['coverage_90']:.0f} % |" in text
 
 
+def test_the_coverage_of_the_critics_of_the_preset_on_hopper_is_what_the_file_says():
+    held = json.loads((ROOT / "results" / "tuned" / "calibration.json").read_text())
+    cells = " · ".join(f"{100 * held[f'hopper-dppo-{seed}']['coverage_90']:.0f}" for seed in range(5))
+    assert f"{cells} % of the returns in their central 90 %" in (ROOT / "docs" / "decisions.md").read_text()
+
+
 @pytest.mark.parametrize("study", ["ordered", "ordered-again"])
 def test_the_coverage_of_ordered_quantiles_is_what_the_file_says(study):
     held = json.loads((ROOT / "results" / study / "calibration.json").read_text())

@@ -95,9 +95,9 @@ def test_what_comes_from_outside_is_escaped(read):
 def test_settings_that_differ_from_the_first_of_the_algorithm_are_highlighted(read):
     first = row("hopper", "ppo")
     policy = first["config"]["policy"] | {"initial_std": 3.0}
-    second = row("walker2d", "ppo") | {"config": first["config"] | {"env": "walker2d", "num_envs": 7, "lam": 0.5, "policy": policy}}
-    _, found = read([first, second, row("swimmer", "dppo")])
-    assert found.text_of("mark") == ["walker2d", "7", "0.5", "3.0"]
+    changed = {"env": "walker2d", "num_envs": 7, "horizon": 9, "gamma": 0.5, "lam": 0.25, "policy": policy}
+    _, found = read([first, row("walker2d", "ppo") | {"config": first["config"] | changed}, row("swimmer", "dppo")])
+    assert found.text_of("mark") == ["walker2d", "7", "9", "0.5", "0.25", "3.0"]
 
 
 def test_every_command_is_there_with_versions_and_machines(read):
