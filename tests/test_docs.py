@@ -133,6 +133,13 @@ def test_distributions_that_are_fitted_to_finished_policies_hold_what_the_docume
     assert {row["checkpoint"]: row["return"] for row in rows}.items() <= finals.items()
 
 
+def test_the_returns_below_the_film_are_those_of_the_policies_in_it():
+    finals = {row.cell: row.final for row in results.read(ROOT / "results" / "tuned").rows}
+    shown = re.findall(r"dgae refit results/tuned/policies/([\w-]+)\.msgpack", (ROOT / "docs" / "results.md").read_text())
+    *most, last = (f"{finals[cell]:,.0f}" for cell in shown)
+    assert f"return {', '.join(most)} and {last} on average" in (ROOT / "README.md").read_text()
+
+
 def test_a_committed_policy_is_there_for_every_result_and_knows_its_configuration():
     for row in results.read(ROOT / "results" / "tuned").rows:
         config = to_dict(directory.config_of(ROOT / "results" / "tuned" / "policies" / f"{row.cell}.msgpack"))
