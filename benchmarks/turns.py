@@ -165,7 +165,7 @@ def main() -> None:
     for name in TASKS:
         known, other = of_step(name, arguments.worlds, arguments.steps)
         print(f"| {name} | {known:,.0f} | {other:,.0f} | {known + other:,.0f} |", flush=True)
-    print("\n| one update | policy: known length | `while` | critic: known length | `while` |\n|---|---|---|---|---|")
+    print("\n| one update, Hopper's preset | policy: known length | `while` | critic: known length | `while` |\n|---|---|---|---|---|")
     for algo in ("ppo", "dppo", "trpo", "dtrpo", "a2c", "da2c"):
         policy, critic = of_update(algo)
         print(f"| {algo} | {policy[0]:,} | {policy[1]:,} | {critic[0]:,} | {critic[1]:,} |", flush=True)
