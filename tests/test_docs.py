@@ -76,6 +76,7 @@ def test_a_table_of_measurements_is_what_its_command_prints(path):
         ("docs/reproduction.md", "paper", ["returns", "improvement"]),
         ("docs/reproduction.md", "paper-one-step", ["returns"]),
         ("docs/attribution.md", "attribution", ["attribution", "attribution-over-tasks"]),
+        ("docs/attribution.md", "attribution-hopper", ["attribution", "attribution-over-tasks"]),
         ("docs/risk.md", "risk", ["risk"]),
     ],
 )
