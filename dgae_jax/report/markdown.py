@@ -39,13 +39,18 @@ class Block(NamedTuple):
 def blocks(path: Path, study: str) -> list[Block]:
     """The tables that a report on `study`, the name of its directory, replaces.
 
-    Raises ConfigError where there are none, or where the markers are missing or do not match.
+    Raises ConfigError where there are none, where the markers are missing or do not match, and where some tables name their study and
+    others do not.
     """
     found = _blocks(path)
-    if all(block.study not in (None, study) for block in found):
-        studies = ", ".join(dict.fromkeys(str(block.study) for block in found))
+    studies = ", ".join(dict.fromkeys(block.study for block in found if block.study))
+    nameless = next((block.name for block in found if block.study is None), None)
+    if nameless and studies:
+        raise invalid("markdown", path, f"a file with {nameless} of STUDY, not {nameless}, where other tables are of {studies}")
+    mine = [block for block in found if block.study in (None, study)]
+    if not mine:
         raise invalid("markdown", path, f"a file with a table of {study}; its tables are of {studies}")
-    return [block for block in found if block.study in (None, study)]
+    return mine
 
 
 def _blocks(path: Path) -> list[Block]:

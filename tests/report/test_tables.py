@@ -134,6 +134,8 @@ def test_a_table_of_a_study_is_replaced_by_a_report_on_that_study_only(grouped, 
         ("<!-- /dgae report -->\n", "a file without <!-- /dgae report --> where no table begins"),
         ("<!-- dgae report: x -->\n<!-- /dgae report -->",
          "a file with tables named returns, improvement, attribution, attribution-over-tasks, risk, reach, speed, not x"),
+        ("<!-- dgae report: returns -->\n<!-- /dgae report -->\n<!-- dgae report: speed of long -->\n<!-- /dgae report -->",
+         "a file with returns of STUDY, not returns, where other tables are of long"),
     ],
 )  # fmt: skip
 def test_markers_that_do_not_match_are_refused(text, sentence, tmp_path):
