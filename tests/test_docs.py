@@ -97,6 +97,17 @@ def test_the_rate_of_similar_means_is_the_mean_of_the_seeds_in_the_file_and_the_
     assert round(float(np.interp(0.00093, rates[::-1], [float(share) for share in shares[::-1]])), 3) == 0.005
 
 
+def test_the_critics_with_settings_that_suit_hopper_hold_and_differ_as_their_file_says():
+    seeds = json.loads((ROOT / "results" / "attribution-hopper" / "calibration.json").read_text()).values()
+    text = (ROOT / "docs" / "attribution.md").read_text()
+    first, second, third, last = (
+        f"{100 * np.mean([one['similar_means'][share] for one in seeds]):.2f} %" for share in ("0.1", "0.03", "0.01", "0.003")
+    )
+    assert f"{first}, {second}, {third} and {last} (`results/attribution-hopper/calibration.json`" in text
+    held = " · ".join(f"{100 * one['coverage_90']:.0f}" for one in seeds)
+    assert f"hold {held} % of the returns" in text
+
+
 def test_the_coverage_of_critics_with_monte_carlo_targets_is_what_the_files_say():
     study, text = ROOT / "results" / "calibration", (ROOT / "docs" / "decisions.md").read_text()
     returns = {row.cell: row.final for row in results.read(study).rows}
