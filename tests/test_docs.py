@@ -87,25 +87,30 @@ def test_the_tables_of_results_are_what_the_report_says(path, study, names, tmp_
     assert document.read_bytes() == (ROOT / path).read_bytes()
 
 
+SHARES = ("0.1", "0.03", "0.01", "0.003")
+"""Of W₁, at most which |d| makes means similar."""
+
+
+def of_critics(study):
+    """What the calibration of a study says of its critics: the rates of similar means by SHARES, and each critic's coverage."""
+    seeds = json.loads((ROOT / "results" / study / "calibration.json").read_text()).values()
+    return [np.mean([one["similar_means"][share] for one in seeds]) for share in SHARES], [one["coverage_90"] for one in seeds]
+
+
 def test_the_rate_of_similar_means_is_the_mean_of_the_seeds_in_the_file_and_the_papers_at_the_threshold_that_is_named():
-    seeds = json.loads((ROOT / "results" / "attribution" / "calibration.json").read_text()).values()
-    shares = ("0.1", "0.03", "0.01", "0.003")
-    rates = [np.mean([one["similar_means"][share] for one in seeds]) for share in shares]
+    rates, _ = of_critics("attribution")
     text = (ROOT / "docs" / "attribution.md").read_text()
-    assert f"| c | {' | '.join(shares)} |" in text
+    assert f"| c | {' | '.join(SHARES)} |" in text
     assert f"| steps | {' | '.join(f'{100 * rate:.2f} %' for rate in rates)} |" in text
-    assert round(float(np.interp(0.00093, rates[::-1], [float(share) for share in shares[::-1]])), 3) == 0.005
+    assert round(float(np.interp(0.00093, rates[::-1], [float(share) for share in SHARES[::-1]])), 3) == 0.005
 
 
 def test_the_critics_with_settings_that_suit_hopper_hold_and_differ_as_their_file_says():
-    seeds = json.loads((ROOT / "results" / "attribution-hopper" / "calibration.json").read_text()).values()
+    rates, held = of_critics("attribution-hopper")
     text = (ROOT / "docs" / "attribution.md").read_text()
-    first, second, third, last = (
-        f"{100 * np.mean([one['similar_means'][share] for one in seeds]):.2f} %" for share in ("0.1", "0.03", "0.01", "0.003")
-    )
-    assert f"{first}, {second}, {third} and {last} (`results/attribution-hopper/calibration.json`" in text
-    held = " · ".join(f"{100 * one['coverage_90']:.0f}" for one in seeds)
-    assert f"hold {held} % of the returns" in text
+    *most, last = (f"{100 * rate:.2f} %" for rate in rates)
+    assert f"{', '.join(most)} and {last} (`results/attribution-hopper/calibration.json`" in text
+    assert f"hold {' · '.join(f'{100 * share:.0f}' for share in held)} % of the returns" in text
 
 
 def test_the_coverage_of_critics_with_monte_carlo_targets_is_what_the_files_say():
