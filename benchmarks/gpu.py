@@ -19,9 +19,9 @@ import physics
 
 import dgae_jax as dg
 from dgae_jax.cli.arguments import parse
-from dgae_jax.configs.build import make_task, make_trainer, seed_keys
-from dgae_jax.configs.config import resolve
+from dgae_jax.configs.resolved import resolve
 from dgae_jax.envs.registry import TASKS
+from dgae_jax.learn.build import make_task, make_trainer, seed_keys
 
 
 @dataclass(frozen=True)
@@ -53,7 +53,9 @@ def against_the_cpu(task: str) -> dict[str, Any]:
     def walk(key, steps):
         state = jax.vmap(env.reset)(jax.random.split(key, 256))
         actions = jax.random.uniform(key, (steps, 256, env.action_size), minval=-1, maxval=1)
-        return jax.lax.scan(lambda s, a: (jax.vmap(env.step)(s, a), None), state, actions)[0], actions[0]
+        return jax.lax.scan(lambda s, a: (jax.vmap(env.step)(s, a), None), state, actions)[
+            0
+        ], actions[0]
 
     with jax.default_device(jax.devices("cpu")[0]):
         given = jax.device_get(jax.jit(walk, static_argnums=1)(jax.random.key(0), 20))
@@ -66,13 +68,30 @@ def against_the_cpu(task: str) -> dict[str, Any]:
 
 def engine(task: str, name: str, worlds: int, arguments: Arguments) -> dict[str, Any]:
     """Environment steps per second, and seconds to compile."""
-    speed, compiling = physics.engine_speed(task, name, worlds, physics.Arguments(seconds=arguments.seconds, device="gpu"))
-    return {"task": task, "engine": name, "worlds": worlds, "steps_per_second": speed, "compile_seconds": compiling}
+    speed, compiling = physics.engine_speed(
+        task, name, worlds, physics.Arguments(seconds=arguments.seconds, device="gpu")
+    )
+    return {
+        "task": task,
+        "engine": name,
+        "worlds": worlds,
+        "steps_per_second": speed,
+        "compile_seconds": compiling,
+    }
 
 
 def training(algo: str, worlds: int, seeds: int, arguments: Arguments) -> dict[str, Any]:
     """Samples per second of all seeds together, seconds to compile, and the most memory so far."""
-    config = resolve(dg.Config(env=arguments.tasks[0], algo=algo, num_envs=worlds, horizon=16, num_seeds=seeds, total_steps=10**7))
+    config = resolve(
+        dg.Config(
+            env=arguments.tasks[0],
+            algo=algo,
+            num_envs=worlds,
+            num_steps=16,
+            num_seeds=seeds,
+            total_steps=10**7,
+        )
+    )
     began = time.perf_counter()
     trainer = make_trainer(make_task(config), 1)
     state = trainer.init(config, seed_keys(config))
@@ -109,14 +128,21 @@ def main() -> None:
     arguments = parse(Arguments, "What an accelerator makes of it.")
     jax.config.update("jax_enable_compilation_cache", False)
     device, began = jax.devices()[0], time.monotonic()
-    found: dict[str, Any] = {"device": device.device_kind, "platform": device.platform, "jax": jax.__version__, "left_out": 0}
+    found: dict[str, Any] = {
+        "device": device.device_kind,
+        "platform": device.platform,
+        "jax": jax.__version__,
+        "left_out": 0,
+    }
     for kind, measure in measurements(arguments):
         if time.monotonic() - began > arguments.limit:
             found["left_out"] += 1
             continue
         try:
             row = measure()
-        except Exception as reason:  # one engine that is not installed, or has no room, leaves the others
+        except (
+            Exception
+        ) as reason:  # one engine that is not installed, or has no room, leaves the others
             row = {"failed": f"{type(reason).__name__}: {str(reason)[:200]}"}
         found.setdefault(kind, []).append(row)
         print(kind, json.dumps(row), flush=True)

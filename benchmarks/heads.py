@@ -21,17 +21,29 @@ from jaxtyping import Array, Float
 
 import dgae_jax as dg
 from dgae_jax.cli.arguments import parse
-from dgae_jax.configs.config import resolve
 from dgae_jax.configs.parts import CRITICS, TARGETS, Part
+from dgae_jax.configs.resolved import resolve
 from dgae_jax.learn.critics import SR_LAMBDA, quantile
 from dgae_jax.learn.types import Batch, Critic, Params
 from dgae_jax.maths.statistics import crps
-from dgae_jax.maths.transport import in_order, quantile_huber_loss
+from dgae_jax.maths.transport import monotone_quantiles, quantile_huber_loss
 from dgae_jax.run import machine
 from dgae_jax.run.calibration import calibrate
 
 Quantiles = Float[Array, "*batch K"]
-Name = Literal["quantile", "plain", "clipped", "sorted", "softplus", "crps", "lambda-0.99", "scaled", "heavy", "heavy-0.01", "ordered"]
+Name = Literal[
+    "quantile",
+    "plain",
+    "clipped",
+    "sorted",
+    "softplus",
+    "crps",
+    "lambda-0.99",
+    "scaled",
+    "heavy",
+    "heavy-0.01",
+    "ordered",
+]
 
 
 @dataclass(frozen=True)
@@ -60,14 +72,25 @@ def over_kappa(quantiles: Quantiles, target: Quantiles, *, kappa: float) -> Floa
     return quantile_huber_loss(quantiles, target, kappa=kappa) / kappa
 
 
-def mean_and_shape(quantiles: Quantiles, target: Quantiles, *, kappa: float) -> Float[Array, "*batch"]:
+def mean_and_shape(
+    quantiles: Quantiles, target: Quantiles, *, kappa: float
+) -> Float[Array, "*batch"]:
     """As the loss of `ordered`, but with the whole weight on the shape, about the mean as it is."""
     mean = quantiles.mean(-1, keepdims=True)
     error = mean[..., 0] - target.mean(-1)
-    return quantiles.shape[-1] / 4 * error**2 + over_kappa(quantiles - mean + jax.lax.stop_gradient(mean), target, kappa=kappa)
+    return quantiles.shape[-1] / 4 * error**2 + over_kappa(
+        quantiles - mean + jax.lax.stop_gradient(mean), target, kappa=kappa
+    )
 
 
-def head(obs_size: int, *, order: Callable = in_order, distance: Callable = quantile_huber_loss, kappa: float, **options) -> Critic:
+def head(
+    obs_size: int,
+    *,
+    order: Callable = monotone_quantiles,
+    distance: Callable = quantile_huber_loss,
+    kappa: float,
+    **options,
+) -> Critic:
     """A quantile critic with `order` behind its network, fitted by `distance`."""
     plain = quantile(obs_size, kappa=kappa, **options)
 
@@ -75,7 +98,9 @@ def head(obs_size: int, *, order: Callable = in_order, distance: Callable = quan
         return order(plain.predict(params, obs))
 
     def loss(params: Params, batch: Batch):
-        return jnp.where(batch.valid, distance(predict(params, batch.obs), batch.target, kappa=kappa), 0).mean(), {}
+        return jnp.where(
+            batch.valid, distance(predict(params, batch.obs), batch.target, kappa=kappa), 0
+        ).mean(), {}
 
     return plain._replace(predict=predict, loss=loss)
 
@@ -88,15 +113,15 @@ CRITICS["scaled"] = Part(partial(head, order=jnp.asarray, distance=over_kappa), 
 CRITICS["heavy"] = Part(partial(head, distance=mean_and_shape), SHARP)
 TARGETS["lambda-0.99"] = Part(SR_LAMBDA._replace(lam=0.99))
 
-NARROW = {"kind": "quantile", "kappa": 0.01, "epochs": 3}
+GAP_BIAS = {"kind": "quantile", "kappa": 0.01, "epochs": 3}
 MEASURED: dict[str, dict] = {
     "quantile": {"kind": "quantile"},
-    "plain": NARROW,
-    "clipped": NARROW | {"max_grad_norm": 0.005},
-    "sorted": NARROW | {"kind": "sorted-before"},
-    "softplus": NARROW | {"kind": "softplus"},
-    "crps": NARROW | {"kind": "crps"},
-    "lambda-0.99": NARROW | {"target": "lambda-0.99"},
+    "plain": GAP_BIAS,
+    "clipped": GAP_BIAS | {"max_grad_norm": 0.005},
+    "sorted": GAP_BIAS | {"kind": "sorted-before"},
+    "softplus": GAP_BIAS | {"kind": "softplus"},
+    "crps": GAP_BIAS | {"kind": "crps"},
+    "lambda-0.99": GAP_BIAS | {"target": "lambda-0.99"},
     "scaled": {"kind": "scaled"},
     "heavy": {"kind": "heavy"},
     "heavy-0.01": {"kind": "heavy", "kappa": 0.01},
@@ -107,12 +132,18 @@ MEASURED: dict[str, dict] = {
 
 def row(task: str, critic: str, seed: int, total_steps: int) -> dict:
     """Train and calibrate one."""
-    start = dataclasses.replace(dg.preset("tuned", "dppo", "walker2d"), env=task)  # one setting for all tasks
+    start = dataclasses.replace(
+        dg.preset("tuned", "dppo", "walker2d"), env=task
+    )  # one setting for all tasks
     fitted = dataclasses.replace(start.critic, **MEASURED[critic])
-    config = resolve(dataclasses.replace(start, physics="native", seed=seed, total_steps=total_steps, critic=fitted))
+    config = resolve(
+        dataclasses.replace(
+            start, physics="native", seed=seed, total_steps=total_steps, critic=fitted
+        )
+    )
     with TemporaryDirectory() as directory:
         run = dg.train(config, Path(directory) / "run", quiet=True)
-        found = calibrate(Path(directory) / "run", config, which="newest")
+        found = calibrate(Path(directory) / "run", config, which="latest")
     about = {"task": task, "critic": critic, "seed": seed, "total_steps": total_steps}
     return {**about, "return": run.evaluation["return_mean"], **found}
 
@@ -122,16 +153,28 @@ def main() -> None:
     arguments = parse(Arguments, "Critics whose quantiles cannot cross.")
     file = arguments.json
     rows = json.loads(file.read_text())["rows"] if file and file.exists() else []
-    known = {(each["task"], each["critic"], each["seed"], each["total_steps"]): each for each in rows}
-    print(f"{'':26s}{'return':>8s}{'in 90 %':>9s}{'crossing':>10s}{'RMSE':>8s}{'spread':>8s}{'CRPS':>8s}")
-    for which in itertools.product(arguments.tasks, arguments.critics, arguments.seeds, [arguments.total_steps]):
+    known = {
+        (each["task"], each["critic"], each["seed"], each["total_steps"]): each for each in rows
+    }
+    print(
+        f"{'':26s}{'return':>8s}{'in 90 %':>9s}{'crossing':>10s}{'RMSE':>8s}{'spread':>8s}{'CRPS':>8s}"
+    )
+    for which in itertools.product(
+        arguments.tasks, arguments.critics, arguments.seeds, [arguments.total_steps]
+    ):
         if which not in known:
             known[which] = row(*which)
             if file:
-                file.write_text(json.dumps({"machine": machine.facts(), "rows": list(known.values())}, indent=1) + "\n")
+                file.write_text(
+                    json.dumps({"machine": machine.facts(), "rows": list(known.values())}, indent=1)
+                    + "\n"
+                )
         found, (task, critic, seed, _) = known[which], which
         shares = f"{found['return']:8,.0f}{found['coverage_90']:9.0%}{found['crossing']:10.0%}"
-        print(f"{task:9s}{critic:12s}{seed:5d}{shares}{found['rmse']:8.3f}{found['spread']:8.3f}{found['crps']:8.3f}", flush=True)
+        print(
+            f"{task:9s}{critic:12s}{seed:5d}{shares}{found['rmse']:8.3f}{found['spread']:8.3f}{found['crps']:8.3f}",
+            flush=True,
+        )
 
 
 if __name__ == "__main__":

@@ -38,8 +38,12 @@ def draw(path: Path) -> None:
     rows = metrics.read(path)
     steps = np.array([row["steps"] for row in rows])
     figure = Figure(figsize=(11, 6.6), layout="constrained", dpi=130)
-    for axes, (name, unit, scale) in zip(figure.subplots(3, 4, sharex=True).flat, PANELS, strict=True):
-        axes.plot(steps, np.array([row[name] for row in rows], float), color="tab:blue", linewidth=1.2)
+    for axes, (name, unit, scale) in zip(
+        figure.subplots(3, 4, sharex=True).flat, PANELS, strict=True
+    ):
+        axes.plot(
+            steps, np.array([row[name] for row in rows], float), color="tab:blue", linewidth=1.2
+        )
         axes.set_title(f"{name} [{unit}]" if unit else name, fontsize=9)
         axes.set_yscale(scale)
         axes.tick_params(labelsize=8)
@@ -52,7 +56,9 @@ def draw(path: Path) -> None:
 
 
 if __name__ == "__main__":
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("file", type=Path)
     parser.add_argument("run", type=Path, nargs="?")
     arguments = parser.parse_args()

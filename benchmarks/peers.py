@@ -29,14 +29,27 @@ LAYOUTS = ((1, False), (8, False), (16, False), (8, True), (16, True))
 
 def all_of(task: str, width: int, seconds: float, samples: dict[str, int]) -> Iterator[Peer]:
     """Every algorithm, with its samples per iteration, in every layout, on one thread of torch and on as many as there are cores."""
-    for algo, (worlds, processes), threads in itertools.product(samples, LAYOUTS, sorted({1, cores()})):
-        speed = steps_per_second(task, algo, width, worlds, processes, threads, samples[algo], seconds)
+    for algo, (worlds, processes), threads in itertools.product(
+        samples, LAYOUTS, sorted({1, cores()})
+    ):
+        speed = steps_per_second(
+            task, algo, width, worlds, processes, threads, samples[algo], seconds
+        )
         where = "processes" if processes else "one process"
         name = f"stable-baselines3 {algo}, {task}, 2 × {width}, {worlds} worlds in {where}, {threads} threads"
         yield Peer(task, algo, width, name, speed)
 
 
-def steps_per_second(task: str, algo: str, width: int, worlds: int, processes: bool, threads: int, samples: int, seconds: float) -> float:
+def steps_per_second(
+    task: str,
+    algo: str,
+    width: int,
+    worlds: int,
+    processes: bool,
+    threads: int,
+    samples: int,
+    seconds: float,
+) -> float:
     """As many iterations as fit, the first left out."""
     import torch  # pyright: ignore[reportMissingImports]
     from stable_baselines3.common.callbacks import BaseCallback  # pyright: ignore[reportMissingImports]
@@ -55,10 +68,14 @@ def steps_per_second(task: str, algo: str, width: int, worlds: int, processes: b
     torch.set_num_threads(threads)
 
     def world() -> gymnasium.Env:
-        gymnasium.logger.min_level = gymnasium.logger.ERROR  # that v4 is not the newest version is known
+        gymnasium.logger.min_level = (
+            gymnasium.logger.ERROR
+        )  # that v4 is not the latest version is known
         return gymnasium.make(TASKS[task].referees["v4"])
 
-    env = VecNormalize(make_vec_env(world, worlds, vec_env_cls=SubprocVecEnv if processes else DummyVecEnv))
+    env = VecNormalize(
+        make_vec_env(world, worlds, vec_env_cls=SubprocVecEnv if processes else DummyVecEnv)
+    )
     _model(algo, env, width, samples // worlds).learn(10**9, callback=Clock())
     env.close()
     return samples // worlds * worlds * (len(ends) - 2) / (ends[-1] - ends[1])
@@ -69,7 +86,11 @@ def _model(algo: str, env: Any, width: int, steps: int) -> Any:
     from sb3_contrib import TRPO  # pyright: ignore[reportMissingImports]
     from stable_baselines3 import A2C, PPO  # pyright: ignore[reportMissingImports]
 
-    common = {"n_steps": steps, "device": "cpu", "policy_kwargs": {"net_arch": {"pi": [width, width], "vf": [width, width]}}}
+    common = {
+        "n_steps": steps,
+        "device": "cpu",
+        "policy_kwargs": {"net_arch": {"pi": [width, width], "vf": [width, width]}},
+    }
     if algo == "A2C":
         return A2C("MlpPolicy", env, **common)
     if algo == "TRPO":

@@ -25,7 +25,10 @@ def all_of(task: str, width: int, seconds: float) -> Iterator[Peer]:
             try:
                 yield Peer(task, "PPO", width, name, measure(task, width, worlds, seconds))
             except Exception as reason:
-                print(f"{name}: {type(reason).__name__}: {str(reason).partition(chr(10))[0][:120]}", flush=True)
+                print(
+                    f"{name}: {type(reason).__name__}: {str(reason).partition(chr(10))[0][:120]}",
+                    flush=True,
+                )
 
 
 class _Clock:
@@ -60,7 +63,10 @@ def brax(task: str, width: int, worlds: int, seconds: float) -> float:
             raise _Over
 
     make = partial(
-        networks.make_ppo_networks, policy_hidden_layer_sizes=(width, width), value_hidden_layer_sizes=(width, width), activation=jnp.tanh
+        networks.make_ppo_networks,
+        policy_hidden_layer_sizes=(width, width),
+        value_hidden_layer_sizes=(width, width),
+        activation=jnp.tanh,
     )
     iterations = 10_000
     with contextlib.suppress(_Over), trainers():
@@ -85,14 +91,21 @@ def rejax(task: str, width: int, worlds: int, seconds: float) -> float:
         num_steps=SAMPLES // worlds, num_epochs=EPOCHS, num_minibatches=MINIBATCHES, normalize_observations=True, normalize_rewards=True,
         total_timesteps=10**6,
     )  # fmt: skip
-    state, step, clock = jax.jit(algo.init_state)(jax.random.key(0)), jax.jit(algo.train_iteration), _Clock(seconds)
+    state, step, clock = (
+        jax.jit(algo.init_state)(jax.random.key(0)),
+        jax.jit(algo.train_iteration),
+        _Clock(seconds),
+    )
     while True:
         state = jax.block_until_ready(step(state))
         if not clock.tick():
             return clock.rate()
 
 
-LIBRARIES: dict[str, tuple[Callable[..., float], tuple[int, ...]]] = {"Brax": (brax, (16, 32)), "rejax": (rejax, (16, 64))}
+LIBRARIES: dict[str, tuple[Callable[..., float], tuple[int, ...]]] = {
+    "Brax": (brax, (16, 32)),
+    "rejax": (rejax, (16, 64)),
+}
 """How each is measured, and with how many worlds; Brax's minibatches must be a multiple of them."""
 
 if __name__ == "__main__":

@@ -57,7 +57,11 @@ class Arguments:
 
     def clock(self) -> float:
         """On a CPU the seconds that this process used, which on one core other programs disturb least."""
-        return time.process_time() if self.device == "cpu" and self.devices == 1 else time.perf_counter()
+        return (
+            time.process_time()
+            if self.device == "cpu" and self.devices == 1
+            else time.perf_counter()
+        )
 
 
 def steps_per_second(run: Callable[[int], Any], worlds: int, arguments: Arguments) -> float:
@@ -95,7 +99,9 @@ def engine_speed(name: str, engine: str, worlds: int, arguments: Arguments) -> t
 
     def some(state, key, count):
         def one(i, state):
-            ctrl = jax.random.uniform(jax.random.fold_in(key, i), (len(state.qpos), physics.model.nu), minval=-1, maxval=1)
+            ctrl = jax.random.uniform(
+                jax.random.fold_in(key, i), (len(state.qpos), physics.model.nu), minval=-1, maxval=1
+            )
             return jax.vmap(physics.step)(state, ctrl)
 
         return jax.lax.fori_loop(0, count, one, state)
@@ -110,7 +116,9 @@ def engine_speed(name: str, engine: str, worlds: int, arguments: Arguments) -> t
     since = arguments.clock()
     compiled = run.lower(state, jax.random.key(0), 1).compile()
     compiling = arguments.clock() - since
-    return steps_per_second(lambda n: jax.block_until_ready(compiled(state, jax.random.key(1), n)), worlds, arguments), compiling
+    return steps_per_second(
+        lambda n: jax.block_until_ready(compiled(state, jax.random.key(1), n)), worlds, arguments
+    ), compiling
 
 
 def speeds(arguments: Arguments) -> None:
@@ -122,7 +130,10 @@ def speeds(arguments: Arguments) -> None:
             print(f"{name:9s} {worlds:6,} {'C':9s} {reference:9,.0f} {1:6.2f}", flush=True)
             for engine in arguments.engines:
                 speed, compiling = engine_speed(name, engine, worlds, arguments)
-                print(f"{name:9s} {worlds:6,} {engine:9s} {speed:9,.0f} {speed / reference:6.2f} {compiling:9.1f}", flush=True)
+                print(
+                    f"{name:9s} {worlds:6,} {engine:9s} {speed:9,.0f} {speed / reference:6.2f} {compiling:9.1f}",
+                    flush=True,
+                )
 
 
 def gymnasium_task(name: str):
@@ -131,7 +142,9 @@ def gymnasium_task(name: str):
     return gymnasium.make(TASKS[name].referees["v4"]).unwrapped
 
 
-def visited(name: str, count: int, act: Callable[[np.ndarray], np.ndarray] | None, dtype: type) -> tuple[np.ndarray, ...]:
+def visited(
+    name: str, count: int, act: Callable[[np.ndarray], np.ndarray] | None, dtype: type
+) -> tuple[np.ndarray, ...]:
     """Poses with the action taken there: of `act`, or random and held actions, episodes of 50 steps that go on when fallen."""
     gym, rng, kept, episode = gymnasium_task(name), np.random.default_rng(0), [], 0
     while len(kept) < count:
@@ -140,7 +153,9 @@ def visited(name: str, count: int, act: Callable[[np.ndarray], np.ndarray] | Non
         for _ in range(50 if act is None else 200):
             action = act(obs) if act else (held if episode % 2 else rng.uniform(-1, 1, held.shape))
             action = np.asarray(action, np.float32)
-            kept.append((gym.data.qpos.astype(dtype), gym.data.qvel.astype(dtype), action.astype(dtype)))
+            kept.append(
+                (gym.data.qpos.astype(dtype), gym.data.qvel.astype(dtype), action.astype(dtype))
+            )
             obs = gym.step(action)[0]
     return tuple(np.stack(x) for x in zip(*kept[:count], strict=True))
 
@@ -158,30 +173,49 @@ def gymnasium_steps(name: str, poses: tuple[np.ndarray, ...]) -> tuple[np.ndarra
     return np.stack(observations), np.array(rewards), contacts
 
 
-def errors(name: str, engine: str, poses: tuple[np.ndarray, ...], observations: np.ndarray, rewards: np.ndarray) -> str:
+def errors(
+    name: str,
+    engine: str,
+    poses: tuple[np.ndarray, ...],
+    observations: np.ndarray,
+    rewards: np.ndarray,
+) -> str:
     """Observation and reward errors of one step in an engine from each pose."""
     env = dg.make_env(name, physics=engine)
 
     @jax.jit
     def step(key, qpos, qvel, action):
-        return jax.vmap(lambda q, v, a: env.step(env.set_state(env.reset(key), q, v), a))(qpos, qvel, action)
+        return jax.vmap(lambda q, v, a: env.step(env.set_state(env.reset(key), q, v), a))(
+            qpos, qvel, action
+        )
 
     after = step(jax.random.key(0), *map(jnp.asarray, poses))
-    median, most, worst = np.quantile(np.abs(observations - np.asarray(after.obs)).max(1), (0.5, 0.99, 1))
+    median, most, worst = np.quantile(
+        np.abs(observations - np.asarray(after.obs)).max(1), (0.5, 0.99, 1)
+    )
     return f"{median:9.1e} {most:9.1e} {worst:9.1e} {np.abs(rewards - np.asarray(after.reward)).max():9.1e}"
 
 
 def exactness(arguments: Arguments) -> None:
     """A row per task, source of states and engine."""
-    print(f"one step against Gymnasium, {'float64' if arguments.x64 else 'float32'}: error of the observation and the reward")
-    print(f"{'task':9s} {'states of':9s} {'engine':9s} {'median':>9s} {'99 %':>9s} {'worst':>9s} {'reward':>9s} {'contacts':>8s}")
-    policies = [(name, None) for name in arguments.tasks] + [policy_of(run) for run in arguments.runs]
+    print(
+        f"one step against Gymnasium, {'float64' if arguments.x64 else 'float32'}: error of the observation and the reward"
+    )
+    print(
+        f"{'task':9s} {'states of':9s} {'engine':9s} {'median':>9s} {'99 %':>9s} {'worst':>9s} {'reward':>9s} {'contacts':>8s}"
+    )
+    policies = [(name, None) for name in arguments.tasks] + [
+        policy_of(run) for run in arguments.runs
+    ]
     for name, act in policies:
         poses = visited(name, arguments.states, act, np.float64 if arguments.x64 else np.float32)
         observations, rewards, contacts = gymnasium_steps(name, poses)
         for engine in arguments.engines:
             row = errors(name, engine, poses, observations, rewards)
-            print(f"{name:9s} {'a policy' if act else 'random':9s} {engine:9s} {row} {contacts:8d}", flush=True)
+            print(
+                f"{name:9s} {'a policy' if act else 'random':9s} {engine:9s} {row} {contacts:8d}",
+                flush=True,
+            )
 
 
 def policy_of(run_dir: Path) -> tuple[str, Callable[[np.ndarray], np.ndarray]]:

@@ -38,13 +38,21 @@ class Arguments:
 
 
 def row(study: Path, cell: Row) -> dict:
-    """Fit and calibrate one, in other episodes than those it was fitted to."""
+    """TrainableState and calibrate one, in other episodes than those it was fitted to."""
     source = study / "policies" / f"{cell.cell}.msgpack"
     with TemporaryDirectory() as place:
-        made, file = refit(source, directory.config_of(source), which="newest"), Path(place) / source.name
+        made, file = (
+            refit(source, directory.config_of(source), which="latest"),
+            Path(place) / source.name,
+        )
         restore.save_networks(file, made.config, made.networks, made.std)
-        found = calibrate(file, made.config, which="newest")
-    about = {"task": cell.env, "critic": f"refit to {cell.algo.upper()}", "seed": cell.seed, "return": cell.final}
+        found = calibrate(file, made.config, which="latest")
+    about = {
+        "task": cell.env,
+        "critic": f"refit to {cell.algo.upper()}",
+        "seed": cell.seed,
+        "return": cell.final,
+    }
     return {**about, **found}
 
 
@@ -60,9 +68,15 @@ def main() -> None:
         if name not in known:
             known[name] = row(arguments.study, cells[name])
             if file:
-                file.write_text(json.dumps({"machine": machine.facts(), "rows": list(known.values())}, indent=1) + "\n")
+                file.write_text(
+                    json.dumps({"machine": machine.facts(), "rows": list(known.values())}, indent=1)
+                    + "\n"
+                )
         shown[name.removesuffix(".msgpack")] = (which[1], known[name])
-        print(f"{name:28s}{known[name]['coverage_90']:6.1%} in 90 %, CRPS {known[name]['crps']:.3f}", flush=True)
+        print(
+            f"{name:28s}{known[name]['coverage_90']:6.1%} in 90 %, CRPS {known[name]['crps']:.3f}",
+            flush=True,
+        )
     if arguments.picture:
         curve.save(picture.histograms(shown), arguments.picture)
 

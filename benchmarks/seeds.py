@@ -48,21 +48,45 @@ def rate(config: Config, seconds: float, core: int | None = None) -> float:
 
 def main() -> None:
     """Print a line for each algorithm and engine."""
-    arguments, context = parse(Arguments, "Seeds side by side."), multiprocessing.get_context("spawn")
+    arguments, context = (
+        parse(Arguments, "Seeds side by side."),
+        multiprocessing.get_context("spawn"),
+    )
     rows = []
-    print(f"{cores()} cores, {arguments.seeds} seeds; samples per second of all\n{'':20s} {'one program':>12s} {'a process each':>15s}")
-    for task, algo, physics in itertools.product(arguments.tasks, arguments.algos, arguments.physics):
+    print(
+        f"{cores()} cores, {arguments.seeds} seeds; samples per second of all\n{'':20s} {'one program':>12s} {'a process each':>15s}"
+    )
+    for task, algo, physics in itertools.product(
+        arguments.tasks, arguments.algos, arguments.physics
+    ):
         one = setting(task, algo, physics, 64)
         with context.Pool(1) as pool:
-            together = pool.apply(rate, (dataclasses.replace(one, num_seeds=arguments.seeds), arguments.seconds))
+            together = pool.apply(
+                rate, (dataclasses.replace(one, num_seeds=arguments.seeds), arguments.seconds)
+            )
         with context.Pool(cores()) as pool:
-            apart = sum(pool.starmap(rate, [(one, arguments.seconds, core) for core in sorted(os.sched_getaffinity(0))], chunksize=1))
+            apart = sum(
+                pool.starmap(
+                    rate,
+                    [(one, arguments.seconds, core) for core in sorted(os.sched_getaffinity(0))],
+                    chunksize=1,
+                )
+            )
         rows.append(
-            {"task": task, "algo": algo, "physics": physics, "seeds": arguments.seeds, "one_program": together, "a_process_each": apart}
+            {
+                "task": task,
+                "algo": algo,
+                "physics": physics,
+                "seeds": arguments.seeds,
+                "one_program": together,
+                "a_process_each": apart,
+            }
         )
         print(f"{task:7s} {algo:5s} {physics:6s} {together:12,.0f} {apart:15,.0f}", flush=True)
     if arguments.json:
-        arguments.json.write_text(json.dumps({"machine": machine.facts(), "rows": rows}, indent=1) + "\n")
+        arguments.json.write_text(
+            json.dumps({"machine": machine.facts(), "rows": rows}, indent=1) + "\n"
+        )
 
 
 if __name__ == "__main__":

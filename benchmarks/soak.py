@@ -34,14 +34,27 @@ class Arguments:
 
 def measured(pid: int) -> dict[str, float]:
     """What a process holds now: resident memory [MB], open files, threads."""
-    status = dict(line.split(":", 1) for line in Path(f"/proc/{pid}/status").read_text().splitlines())
+    status = dict(
+        line.split(":", 1) for line in Path(f"/proc/{pid}/status").read_text().splitlines()
+    )
     handles = len(list(Path(f"/proc/{pid}/fd").iterdir()))
-    return {"rss": int(status["VmRSS"].split()[0]) / 1024, "files": handles, "threads": int(status["Threads"])}
+    return {
+        "rss": int(status["VmRSS"].split()[0]) / 1024,
+        "files": handles,
+        "threads": int(status["Threads"]),
+    }
 
 
 def main() -> int:
     arguments = parse(Arguments, "Watch the memory of a long run.")
-    argv = ["--run-dir", str(arguments.run_dir), "--physics", "native", "--total-steps", "1_000_000_000"]
+    argv = [
+        "--run-dir",
+        str(arguments.run_dir),
+        "--physics",
+        "native",
+        "--total-steps",
+        "1_000_000_000",
+    ]
     process = subprocess.Popen([sys.executable, str(TRAIN), *argv], stdout=subprocess.DEVNULL)
     began, rows = time.monotonic(), []
     while (seconds := time.monotonic() - began) < 60 * arguments.minutes and process.poll() is None:
@@ -54,15 +67,23 @@ def main() -> int:
     process.send_signal(signal.SIGTERM)
     code, stopping = process.wait(), time.monotonic() - since
     if len(rows) < 4:
-        print(f"error: the run ended, with exit code {code}, before there were four measurements", file=sys.stderr)
+        print(
+            f"error: the run ended, with exit code {code}, before there were four measurements",
+            file=sys.stderr,
+        )
         return 1
     steps = metrics.read(arguments.run_dir / "metrics.jsonl")[-1]["steps"]
-    print(f"{steps:,} samples in {arguments.minutes:g} minutes, then SIGTERM: exit code {code} after {stopping:.1f} s")
+    print(
+        f"{steps:,} samples in {arguments.minutes:g} minutes, then SIGTERM: exit code {code} after {stopping:.1f} s"
+    )
     grown = False
     for name, unit, slack in (("rss", " MB", 1.05), ("files", "", 1.0), ("threads", "", 1.0)):
         column = [row[name] for row in rows]
         quarter = len(column) // 4
-        second, fourth = statistics.median(column[quarter : 2 * quarter]), statistics.median(column[-quarter:])
+        second, fourth = (
+            statistics.median(column[quarter : 2 * quarter]),
+            statistics.median(column[-quarter:]),
+        )
         shown = f"start {column[0]:,.0f}, second quarter {second:,.0f}, last quarter {fourth:,.0f}, end {column[-1]:,.0f}"
         print(f"{name}: {shown}{unit}")
         grown |= fourth > slack * second

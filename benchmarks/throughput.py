@@ -32,12 +32,13 @@ from turns import counted
 
 import dgae_jax as dg
 from dgae_jax.cli.arguments import parse
-from dgae_jax.configs.build import make_policy, make_task, make_trainer, seed_keys
-from dgae_jax.configs.config import Config, resolve
+from dgae_jax.configs.config import Config
+from dgae_jax.configs.resolved import resolve
 from dgae_jax.learn import devices
+from dgae_jax.learn.build import make_policy, make_task, make_trainer, seed_keys
 from dgae_jax.learn.iteration import _estimate, _roll_out, acting, nothing
 from dgae_jax.learn.parallel import COMPILER_OPTIONS
-from dgae_jax.learn.types import Fitted
+from dgae_jax.learn.types import InferenceState
 from dgae_jax.physics.cores import cores
 from dgae_jax.run import machine
 from dgae_jax.run.options import RunOptions
@@ -96,9 +97,16 @@ def setting(task: str, algo: str, physics: str, width: int) -> Config:
     config = dataclasses.replace(dg.preset("tuned", algo, "walker2d"), env=task)
     as_peer = PEER_OF[algo] == "A2C"
     steps = {"optimizer": "rmsprop", "epochs": 1, "minibatches": 1} if as_peer else {}
-    policy, critic = (dataclasses.replace(part, hidden=(width, width), **steps) for part in (config.policy, config.critic))
-    horizon = 8 if as_peer else config.horizon
-    return resolve(dataclasses.replace(config, physics=physics, horizon=horizon, policy=policy, critic=critic))
+    policy, critic = (
+        dataclasses.replace(part, hidden=(width, width), **steps)
+        for part in (config.policy, config.critic)
+    )
+    num_steps = 8 if as_peer else config.num_steps
+    return resolve(
+        dataclasses.replace(
+            config, physics=physics, num_steps=num_steps, policy=policy, critic=critic
+        )
+    )
 
 
 class Iteration(NamedTuple):
@@ -153,14 +161,16 @@ def taken_apart(config: Config, count: int) -> Pieces:
     init, _ = dg.make_train(algorithm, env, config)
     key = jax.random.key(0)
     state = jax.jit(init)(key)
-    keys = jax.random.split(key, (config.horizon, config.num_envs))
+    keys = jax.random.split(key, (config.num_steps, config.num_envs))
 
     @devices.shared_by(mesh)
     def roll(state, keys):
         return _roll_out(env, algorithm, state, keys, config.episode_length)
 
     def estimate(state, step):
-        return _estimate(algorithm, state, step, step.reward, key, config.gamma, config.lam, nothing)[0]
+        return _estimate(
+            algorithm, state, step, step.reward, key, config.gamma, config.gae_lambda, nothing
+        )[0]
 
     step = jax.device_get(jax.jit(roll)(state, keys)[1])
     batch = jax.jit(estimate)(state, step)
@@ -187,23 +197,33 @@ def roofline(config: Config) -> float:
     products = flops / product_rate()
     quantiles, fit = config.critic.quantiles, config.critic
     targets = 1 if fit.target == "lambda-return" else quantiles
-    residuals = (fit.epochs or 0) * config.samples_per_iteration * quantiles * targets if quantiles and targets else 0
-    return c_seconds(config.env, config.num_envs, config.horizon) + products + residuals / (cores() * residual_rate(quantiles or 1))
+    residuals = (
+        (fit.epochs or 0) * config.samples_per_iteration * quantiles * targets
+        if quantiles and targets
+        else 0
+    )
+    return (
+        c_seconds(config.env, config.num_envs, config.num_steps)
+        + products
+        + residuals / (cores() * residual_rate(quantiles or 1))
+    )
 
 
 def _without_physics(config: Config) -> list[tuple[Callable, tuple]]:
     """Acting on all samples, estimating, fitting."""
     pieces = taken_apart(dataclasses.replace(config, physics="native"), 1)
     state, _ = pieces.rollout[1]
-    actor, env = Fitted(state.policy.params, state.observations), make_task(config)
+    actor, env = InferenceState(state.policy.params, state.observations), make_task(config)
     act = acting(make_policy(env, config), actor)
     keys, obs = jax.random.split(jax.random.key(0), config.num_envs), state.episodes.env.obs
-    draw = lambda: jax.lax.scan(lambda c, _: (c, act(keys, obs)[0]), 0, None, length=config.horizon)[1]  # noqa: E731
+    draw = lambda: jax.lax.scan(
+        lambda c, _: (c, act(keys, obs)[0]), 0, None, length=config.num_steps
+    )[1]  # noqa: E731
     return [(draw, ()), *pieces[1:]]
 
 
 @functools.cache
-def c_seconds(task: str, worlds: int, horizon: int) -> float:
+def c_seconds(task: str, worlds: int, num_steps: int) -> float:
     """C MuJoCo alone, on all cores, under random controls [s]."""
     env: Any = dg.make_env(task, physics="native")
     model, rng = env._physics.model, np.random.default_rng(0)
@@ -211,7 +231,7 @@ def c_seconds(task: str, worlds: int, horizon: int) -> float:
     batch.bind("qpos")[:] = model.qpos0
 
     def run() -> None:
-        for _ in range(horizon):
+        for _ in range(num_steps):
             batch.bind("ctrl")[:] = rng.uniform(-1, 1, (worlds, model.nu))
             batch.step(nstep=env.FRAME_SKIP)
 
@@ -231,13 +251,18 @@ def residual_rate(quantiles: int) -> float:
     """Residuals per second of the quantile-Huber loss with its derivatives on one core."""
     x = jax.random.normal(jax.random.key(0), (64, quantiles))
     slopes = jax.grad(lambda z, t: dg.quantile_huber_loss(z, t).sum())
-    many = jax.jit(lambda x: jax.lax.fori_loop(0, 100, lambda i, y: y - 1e-3 * slopes(y, x), 2 * x), compiler_options=COMPILER_OPTIONS)
+    many = jax.jit(
+        lambda x: jax.lax.fori_loop(0, 100, lambda i, y: y - 1e-3 * slopes(y, x), 2 * x),
+        compiler_options=COMPILER_OPTIONS,
+    )
     return 100 * 64 * quantiles**2 / fastest(lambda: many(x), 1.0)
 
 
 def settings(arguments: Arguments) -> Iterator[Config]:
     """All of ours, one after the other."""
-    for task, width, physics, algo in itertools.product(arguments.tasks, arguments.widths, arguments.physics, arguments.algos):
+    for task, width, physics, algo in itertools.product(
+        arguments.tasks, arguments.widths, arguments.physics, arguments.algos
+    ):
         yield setting(task, algo, physics, width)
 
 
@@ -247,17 +272,26 @@ def main() -> None:
     others = []
     if arguments.peers:
         for task, width in itertools.product(arguments.tasks, arguments.widths):
-            samples = {PEER_OF[algo]: setting(task, algo, "native", width).samples_per_iteration for algo in arguments.algos}
+            samples = {
+                PEER_OF[algo]: setting(task, algo, "native", width).samples_per_iteration
+                for algo in arguments.algos
+            }
             theirs = peers.all_of(task, width, arguments.seconds, samples)
-            for measured in itertools.chain(theirs, peers_jax.all_of(task, width, arguments.seconds)):
+            for measured in itertools.chain(
+                theirs, peers_jax.all_of(task, width, arguments.seconds)
+            ):
                 others.append(measured)
                 print(f"{measured.name:76s} {measured.steps_per_second:9,.0f}", flush=True)
-    print(f"{cores()} cores, {jax.devices()[0].device_kind}, jax {jax.__version__}; milliseconds of each part alone")
+    print(
+        f"{cores()} cores, {jax.devices()[0].device_kind}, jax {jax.__version__}; milliseconds of each part alone"
+    )
     head = f"{'task':7s} {'algo':5s} {'physics':7s} {'width':>5s} {'compile s':>9s} {'steps/s':>9s} {'/ peer':>7s} {'/ roofline':>10s}"
     print(head, *(f"{name:>9s}" for name in Pieces._fields))
     rows = []
     for config in settings(arguments):
-        with multiprocessing.get_context("spawn").Pool(1) as process:  # JAX starts with as many devices as the run has
+        with multiprocessing.get_context("spawn").Pool(
+            1
+        ) as process:  # JAX starts with as many devices as the run has
             row = process.apply(ours, (config, arguments.seconds))
         rows.append(row)
         rival = rival_of(dataclasses.asdict(row), [dataclasses.asdict(o) for o in others])
@@ -270,7 +304,11 @@ def main() -> None:
         )
     if arguments.json:
         facts = {**machine.facts(), "jax": jax.__version__}
-        found = {"machine": facts, "ours": [dataclasses.asdict(r) for r in rows], "peers": [dataclasses.asdict(o) for o in others]}
+        found = {
+            "machine": facts,
+            "ours": [dataclasses.asdict(r) for r in rows],
+            "peers": [dataclasses.asdict(o) for o in others],
+        }
         arguments.json.parent.mkdir(parents=True, exist_ok=True)
         arguments.json.write_text(json.dumps(found, indent=1) + "\n")
 

@@ -19,9 +19,9 @@ import numpy as np
 
 import dgae_jax as dg
 from dgae_jax.cli.arguments import parse
-from dgae_jax.configs.config import resolve
+from dgae_jax.configs.resolved import resolve
 from dgae_jax.envs.registry import TASKS
-from dgae_jax.learn.types import Batch, Fit
+from dgae_jax.learn.types import Batch, TrainableState
 
 CALLS = {"jit": "jaxpr", "pjit": "jaxpr", "checkpoint": "jaxpr", "custom_vmap_call": "call", "closed_call": "call_jaxpr",
          "custom_jvp_call": "call_jaxpr", "custom_vjp_call": "call_jaxpr"}  # fmt: skip
@@ -66,9 +66,14 @@ def counted(f: Callable, platform: str | None = None) -> Callable:
 def _run(program: Any, args: list, platform: str | None) -> tuple[list, Counts]:
     """The program's outputs and what it does."""
     jaxpr, consts = (program.jaxpr, program.consts) if hasattr(program, "consts") else (program, [])
-    values, counts = dict(zip([*jaxpr.constvars, *jaxpr.invars], [*consts, *args], strict=True)), NONE
+    values, counts = (
+        dict(zip([*jaxpr.constvars, *jaxpr.invars], [*consts, *args], strict=True)),
+        NONE,
+    )
     for eqn in jaxpr.eqns:
-        out, more = _evaluate(eqn, [x.val if hasattr(x, "val") else values[x] for x in eqn.invars], platform)
+        out, more = _evaluate(
+            eqn, [x.val if hasattr(x, "val") else values[x] for x in eqn.invars], platform
+        )
         values.update(zip(eqn.outvars, out, strict=True))
         counts = _add(counts, more)
     return [x.val if hasattr(x, "val") else values[x] for x in jaxpr.outvars], counts
@@ -83,11 +88,17 @@ def _evaluate(eqn: Any, args: list, platform: str | None) -> tuple[list, Counts]
     if name == "custom_linear_solve":  # conjugate gradient
         lengths = how["const_lengths"]
         before = lengths.matvec + lengths.vecmat
-        return _run(how["jaxprs"].solve, args[before : before + lengths.solve] + args[sum(lengths) :], platform)
+        return _run(
+            how["jaxprs"].solve,
+            args[before : before + lengths.solve] + args[sum(lengths) :],
+            platform,
+        )
     if name in CALLS:
         return _run(how[CALLS[name]], args, platform)
     if name == "cond":
-        return jax.lax.switch(args[0], [lambda *x, b=b: _run(b, [*x], platform) for b in how["branches"]], *args[1:])
+        return jax.lax.switch(
+            args[0], [lambda *x, b=b: _run(b, [*x], platform) for b in how["branches"]], *args[1:]
+        )
     if name == "scan":
         fixed, carry, xs = _split(args, how["num_consts"], how["num_carry"])
 
@@ -95,8 +106,12 @@ def _evaluate(eqn: Any, args: list, platform: str | None) -> tuple[list, Counts]
             out, more = _run(how["jaxpr"], [*fixed, *state[0], *x], platform)
             return (out[: len(carry)], _add(state[1], more)), out[len(carry) :]
 
-        (carry, counts), ys = jax.lax.scan(turn, (carry, NONE), xs, length=how["length"], reverse=how["reverse"])
-        return [*carry, *ys], counts._replace(known=counts.known + -(-how["length"] // how["unroll"]))
+        (carry, counts), ys = jax.lax.scan(
+            turn, (carry, NONE), xs, length=how["length"], reverse=how["reverse"]
+        )
+        return [*carry, *ys], counts._replace(
+            known=counts.known + -(-how["length"] // how["unroll"])
+        )
     if name == "while":
         asked, fixed, carry = _split(args, how["cond_nconsts"], how["body_nconsts"])
 
@@ -104,16 +119,26 @@ def _evaluate(eqn: Any, args: list, platform: str | None) -> tuple[list, Counts]
             out, more = _run(how["body_jaxpr"], [*fixed, *state[0]], platform)
             return out, _add(state[1], more)._replace(asked=state[1].asked + more.asked + 1)
 
-        return jax.lax.while_loop(lambda s: _run(how["cond_jaxpr"], [*asked, *s[0]], platform)[0][0], repeat, (carry, NONE))
+        return jax.lax.while_loop(
+            lambda s: _run(how["cond_jaxpr"], [*asked, *s[0]], platform)[0][0],
+            repeat,
+            (carry, NONE),
+        )
     out = eqn.primitive.bind(*args, **how)
-    return out if eqn.primitive.multiple_results else [out], NONE._replace(flops=jnp.float32(_flops(eqn)))
+    return out if eqn.primitive.multiple_results else [out], NONE._replace(
+        flops=jnp.float32(_flops(eqn))
+    )
 
 
 def _flops(eqn: Any) -> int:
     if eqn.primitive.name != "dot_general":
         return 0
     (contracted, _), _ = eqn.params["dimension_numbers"]
-    return 2 * math.prod(eqn.outvars[0].aval.shape) * math.prod(eqn.invars[0].aval.shape[i] for i in contracted)
+    return (
+        2
+        * math.prod(eqn.outvars[0].aval.shape)
+        * math.prod(eqn.invars[0].aval.shape[i] for i in contracted)
+    )
 
 
 def _split(items: list, *sizes: int) -> tuple[list, ...]:
@@ -149,11 +174,18 @@ def of_update(algo: str) -> list[list[int]]:
     action, row = jax.random.normal(key, (size, env.action_size)), jax.random.normal(key, (size,))
     quantiles = algorithm.critic.predict(algorithm.critic.init(key), obs)
     log_prob = jnp.zeros(size) - env.action_size
-    batch = Batch(obs, action, log_prob, row, row, quantiles, row, row, next_obs, jnp.ones(size, bool))
+    batch = Batch(
+        obs, action, log_prob, row, row, quantiles, row, row, next_obs, jnp.ones(size, bool)
+    )
     found = []
-    for network, update in ((algorithm.policy, algorithm.policy_update), (algorithm.critic, algorithm.critic_update)):
+    for network, update in (
+        (algorithm.policy, algorithm.policy_update),
+        (algorithm.critic, algorithm.critic_update),
+    ):
         params = network.init(key)
-        _, counts = counted(partial(update.step, key))(Fit(params, update.init(params)), batch)
+        _, counts = counted(partial(update.step, key))(
+            TrainableState(params, update.init(params)), batch
+        )
         found.append([int(counts.known), int(counts.asked)])
     return found
 
@@ -161,14 +193,21 @@ def of_update(algo: str) -> list[list[int]]:
 def main() -> None:
     """Print both tables, in Markdown."""
     arguments = parse(Arguments, "Turns of loops in a step and in an update.")
-    print(f"| one environment step of {arguments.worlds:,} worlds, `jax` | known length | `while` | together |\n|---|---|---|---|")
+    print(
+        f"| one environment step of {arguments.worlds:,} worlds, `jax` | known length | `while` | together |\n|---|---|---|---|"
+    )
     for name in TASKS:
         known, other = of_step(name, arguments.worlds, arguments.steps)
         print(f"| {name} | {known:,.0f} | {other:,.0f} | {known + other:,.0f} |", flush=True)
-    print("\n| one update, Hopper's preset | policy: known length | `while` | critic: known length | `while` |\n|---|---|---|---|---|")
+    print(
+        "\n| one update, Hopper's preset | policy: known length | `while` | critic: known length | `while` |\n|---|---|---|---|---|"
+    )
     for algo in ("ppo", "dppo", "trpo", "dtrpo", "a2c", "da2c"):
         policy, critic = of_update(algo)
-        print(f"| {algo} | {policy[0]:,} | {policy[1]:,} | {critic[0]:,} | {critic[1]:,} |", flush=True)
+        print(
+            f"| {algo} | {policy[0]:,} | {policy[1]:,} | {critic[0]:,} | {critic[1]:,} |",
+            flush=True,
+        )
 
 
 if __name__ == "__main__":

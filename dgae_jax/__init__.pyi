@@ -1,9 +1,8 @@
-from .configs.build import make_algorithm, make_train
-from .configs.config import ConfigError, NoiseConfig
+from .configs.config import Config, ConfigError, CriticConfig, NoiseConfig, PolicyConfig
 from .configs.presets import preset
-from .configs.pytree import Config, CriticConfig, PolicyConfig
 from .envs.registry import make_env
 from .export.vector import make_vector_env
+from .learn.build import make_algorithm, make_train
 from .maths.returns import (
     bellman_target,
     dgae,
@@ -18,7 +17,12 @@ from .maths.returns import (
 )
 from .maths.risk import METRICS, weights_of
 from .maths.statistics import bootstrap_interval, coverage, crps, explained_variance, iqm, pit
-from .maths.transport import directional_metric, quantile_huber_loss, quantile_midpoints, wasserstein
+from .maths.transport import (
+    directional_metric,
+    quantile_huber_loss,
+    quantile_midpoints,
+    wasserstein,
+)
 from .run.api import Run, load_policy, train
 from .run.checkpoint import CheckpointError
 from .run.training import RunError

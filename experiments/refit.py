@@ -1,4 +1,4 @@
-"""Fit a value distribution to a finished policy: python experiments/refit.py RUN_DIR"""
+"""TrainableState a value distribution to a finished policy: python experiments/refit.py RUN_DIR"""
 
 import sys
 

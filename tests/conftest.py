@@ -6,12 +6,16 @@ import tempfile
 
 import jaxtyping
 
-jaxtyping.install_import_hook([f"dgae_jax.{room}" for room in ("maths", "physics", "envs", "learn")], "beartype.beartype")
+jaxtyping.install_import_hook(
+    [f"dgae_jax.{room}" for room in ("maths", "physics", "envs", "learn")], "beartype.beartype"
+)
 
 import jax  # noqa: E402
 import pytest  # noqa: E402
 
-jax.config.update("jax_compilation_cache_dir", os.path.join(tempfile.gettempdir(), "dgae_jax_tests"))  # noqa: PTH118
+jax.config.update(
+    "jax_compilation_cache_dir", os.path.join(tempfile.gettempdir(), "dgae_jax_tests")
+)  # noqa: PTH118
 
 
 OPTIMIZATIONS = "JAX_DISABLE_MOST_OPTIMIZATIONS"

@@ -26,7 +26,7 @@ SMALL = dg.Config(
     physics="native",
     total_steps=64 * 20,
     num_envs=4,
-    horizon=16,
+    num_steps=16,
     policy=dg.PolicyConfig(hidden=(8,), epochs=2, minibatches=4),
     critic=dg.CriticConfig(hidden=(8,), epochs=2, minibatches=4, quantiles=8),
 )
@@ -35,11 +35,13 @@ SMALL = dg.Config(
 def small(algo, **changes):
     """The small configuration of an algorithm, without the settings that it does not use."""
     policy = dg.PolicyConfig(hidden=(8,)) if "trpo" in algo else SMALL.policy
-    critic = SMALL.critic if algo.startswith("d") else dataclasses.replace(SMALL.critic, quantiles=None)
+    critic = (
+        SMALL.critic if algo.startswith("d") else dataclasses.replace(SMALL.critic, quantiles=None)
+    )
     return dataclasses.replace(SMALL, algo=algo, policy=policy, critic=critic, **changes)
 
 
-TINY = ["--physics", "native", "--num-envs", "4", "--horizon", "16", "--policy.minibatches", "4", "--critic.minibatches", "4",
+TINY = ["--physics", "native", "--num-envs", "4", "--num-steps", "16", "--policy.minibatches", "4", "--critic.minibatches", "4",
         "--policy.hidden", "8", "--critic.hidden", "8", "--cache-dir", str(Path(tempfile.gettempdir()) / "dgae_jax_tests")]  # fmt: skip
 """Flags of a small run; processes share its compiled programs."""
 
@@ -51,14 +53,33 @@ def command(name):
 
 def signed(arrays):
     """Any bytes with the header of a checkpoint."""
-    return json.dumps({"schema": checkpoint.SCHEMA, "sha256": hashlib.sha256(arrays).hexdigest()}).encode() + b"\n" + arrays
+    return (
+        json.dumps(
+            {"schema": checkpoint.SCHEMA, "sha256": hashlib.sha256(arrays).hexdigest()}
+        ).encode()
+        + b"\n"
+        + arrays
+    )
 
 
 def film_of(path):
     """The frames [F, H, W, 3] of a video, and its frames per second."""
-    program = [imageio_ffmpeg.get_ffmpeg_exe(), "-i", str(path), "-fps_mode", "passthrough", "-f", "rawvideo", "-pix_fmt", "rgb24", "-"]
+    program = [
+        imageio_ffmpeg.get_ffmpeg_exe(),
+        "-i",
+        str(path),
+        "-fps_mode",
+        "passthrough",
+        "-f",
+        "rawvideo",
+        "-pix_fmt",
+        "rgb24",
+        "-",
+    ]
     done = subprocess.run(program, capture_output=True, check=True)
-    width, height, fps = re.search(r"Video: .*?, (\d+)x(\d+).*? ([\d.]+) fps", done.stderr.decode()).groups()
+    width, height, fps = re.search(
+        r"Video: .*?, (\d+)x(\d+).*? ([\d.]+) fps", done.stderr.decode()
+    ).groups()
     return np.frombuffer(done.stdout, np.uint8).reshape(-1, int(height), int(width), 3), float(fps)
 
 

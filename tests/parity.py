@@ -16,7 +16,9 @@ from tests.helpers import GYM_TASKS
 
 COUNT = 128
 
-WARP = pytest.mark.skipif(find_spec("warp") is None, reason="needs warp-lang: pip install 'dgae_jax[warp]'")
+WARP = pytest.mark.skipif(
+    find_spec("warp") is None, reason="needs warp-lang: pip install 'dgae_jax[warp]'"
+)
 UPSTREAM = pytest.mark.xfail(
     strict=True,
     raises=AssertionError,
@@ -43,8 +45,12 @@ def states(name):
             data.qpos[:] += rng.uniform(-0.2, 0.2, model.nq)
             data.qvel[:] += rng.uniform(-1, 1, model.nv)
             held = rng.uniform(-1.2, 1.2, model.nu)
-        ctrl = (held if len(kept) % 64 < 32 else rng.uniform(-1.2, 1.2, model.nu)).astype(np.float32)
-        kept.append((*(x.astype(np.float32) for x in (data.qpos, data.qvel, data.qacc_warmstart)), ctrl))
+        ctrl = (held if len(kept) % 64 < 32 else rng.uniform(-1.2, 1.2, model.nu)).astype(
+            np.float32
+        )
+        kept.append(
+            (*(x.astype(np.float32) for x in (data.qpos, data.qvel, data.qacc_warmstart)), ctrl)
+        )
         data.ctrl[:] = ctrl
         mujoco.mj_step(model, data, nstep=GYM_TASKS[name].FRAME_SKIP)
     return tuple(np.stack(x) for x in zip(*kept, strict=True))
@@ -56,11 +62,18 @@ def reference(name):
     model = model_of(name)
     data, after, contacts = mujoco.MjData(model), [], []
     for qpos, qvel, warmstart, ctrl in zip(*states(name), strict=True):
-        data.qpos[:], data.qvel[:], data.qacc_warmstart[:], data.ctrl[:] = qpos, qvel, warmstart, ctrl
+        data.qpos[:], data.qvel[:], data.qacc_warmstart[:], data.ctrl[:] = (
+            qpos,
+            qvel,
+            warmstart,
+            ctrl,
+        )
         mujoco.mj_step(model, data, nstep=GYM_TASKS[name].FRAME_SKIP)
         mujoco.mj_rnePostConstraint(model, data)
         xpos = data.xpos[1:2] if name == "ant" else data.xpos[:0]
-        after.append([x.copy() for x in (data.qpos, data.qvel, data.qacc_warmstart, xpos, data.cfrc_ext)])
+        after.append(
+            [x.copy() for x in (data.qpos, data.qvel, data.qacc_warmstart, xpos, data.cfrc_ext)]
+        )
         contacts.append(data.ncon)
     return PhysicsState(*(np.stack(x) for x in zip(*after, strict=True))), np.array(contacts)
 
@@ -69,8 +82,15 @@ def reference(name):
 def stepped(name, engine, *, x64=False):
     """What an engine makes of the states."""
     with jax.enable_x64(x64):
-        physics = make_physics(engine, load_spec(GYM_TASKS[name].FILE["v4"]), GYM_TASKS[name].FRAME_SKIP, reads_of(name))
-        qpos, qvel, warmstart, ctrl = (jnp.asarray(x, float if x64 else jnp.float32) for x in states(name))
+        physics = make_physics(
+            engine,
+            load_spec(GYM_TASKS[name].FILE["v4"]),
+            GYM_TASKS[name].FRAME_SKIP,
+            reads_of(name),
+        )
+        qpos, qvel, warmstart, ctrl = (
+            jnp.asarray(x, float if x64 else jnp.float32) for x in states(name)
+        )
         state = physics.at_pose(qpos, qvel)._replace(qacc_warmstart=warmstart)
         return jax.tree.map(np.asarray, jax.jit(jax.vmap(physics.step))(state, ctrl))
 

@@ -25,7 +25,9 @@ class Counter(Env):
     def step(self, state, action):
         count = state.obs[0] + 1
         done = (count >= self.length).astype(jnp.float32)
-        return state.replace(obs=state.obs.at[0].set(count), reward=count, done=done, metrics={"action": action[0]})
+        return state.replace(
+            obs=state.obs.at[0].set(count), reward=count, done=done, metrics={"action": action[0]}
+        )
 
 
 class Fragile(Counter):
@@ -41,7 +43,12 @@ class Fragile(Counter):
     def step(self, state, action):
         after = super().step(state, action)
         chosen = jnp.where(after.obs[0] == 3, jnp.floor(2 * len(self.parts) * after.obs[1]), -1)
-        return after.replace(**{part: jnp.where(chosen == i, self.value, getattr(after, part)) for i, part in enumerate(self.parts)})
+        return after.replace(
+            **{
+                part: jnp.where(chosen == i, self.value, getattr(after, part))
+                for i, part in enumerate(self.parts)
+            }
+        )
 
 
 class Target(Env):

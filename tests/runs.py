@@ -6,7 +6,7 @@ from pathlib import Path
 
 import jax.numpy as jnp
 
-from dgae_jax.configs.config import resolve
+from dgae_jax.configs.resolved import resolve
 from dgae_jax.run import checkpoint, metrics
 from dgae_jax.run.options import RunOptions
 from tests import helpers
@@ -24,18 +24,27 @@ QUIET = RunOptions(
 
 def small(algo="ppo", physics="native", seeds=1):
     """The small run of an algorithm, resolved as a run has it."""
-    shape = {"total_steps": ITERATIONS * SMALL.samples_per_iteration, "episode_length": 20, "num_seeds": seeds}
+    shape = {
+        "total_steps": ITERATIONS * SMALL.samples_per_iteration,
+        "episode_length": 20,
+        "num_seeds": seeds,
+    }
     return resolve(helpers.small(algo, physics=physics, **shape))
 
 
 def saved(state, directory, steps, **keep):
     """A checkpoint of `state` after so many samples."""
-    then = state._replace(iteration=jnp.full_like(state.iteration, steps // SMALL.samples_per_iteration))
+    then = state._replace(
+        iteration=jnp.full_like(state.iteration, steps // SMALL.samples_per_iteration)
+    )
     return checkpoint.save(directory, SMALL, checkpoint.arrays_of(then), steps, **keep)
 
 
 def timeless(run_dir):
-    return [{k: v for k, v in row.items() if k != "seconds"} for row in metrics.read(run_dir / "metrics.jsonl")]
+    return [
+        {k: v for k, v in row.items() if k != "seconds"}
+        for row in metrics.read(run_dir / "metrics.jsonl")
+    ]
 
 
 def last(run_dir):

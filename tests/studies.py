@@ -7,7 +7,21 @@ import sys
 from dgae_jax.run import metrics
 from tests.helpers import ROOT, TINY
 
-SHAPE = [*TINY, "--envs", "hopper", "--algos", "ppo", "dppo", "--seeds", "0", "1", "--total-steps", str(64 * 10), "--episodes", "2"]
+SHAPE = [
+    *TINY,
+    "--envs",
+    "hopper",
+    "--algos",
+    "ppo",
+    "dppo",
+    "--seeds",
+    "0",
+    "1",
+    "--total-steps",
+    str(64 * 10),
+    "--episodes",
+    "2",
+]
 """Four cells of ten iterations."""
 
 TIMES = ("seconds", "samples_per_second", "command")
@@ -16,8 +30,18 @@ TIMES = ("seconds", "samples_per_second", "command")
 
 def start(study, *more):
     """The real command."""
-    words = [sys.executable, "experiments/reproduce.py", str(study), *SHAPE, "--checkpoint-every", "320", *more]
-    return subprocess.Popen(words, cwd=ROOT, text=True, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+    words = [
+        sys.executable,
+        "experiments/reproduce.py",
+        str(study),
+        *SHAPE,
+        "--checkpoint-every",
+        "320",
+        *more,
+    ]
+    return subprocess.Popen(
+        words, cwd=ROOT, text=True, stdout=subprocess.PIPE, stderr=subprocess.PIPE
+    )
 
 
 def finish(process):
@@ -28,7 +52,10 @@ def finish(process):
 
 def rows(study):
     """Of the results, without their times."""
-    return [{k: v for k, v in row.items() if k not in TIMES} for row in metrics.read(study / "results.jsonl")]
+    return [
+        {k: v for k, v in row.items() if k not in TIMES}
+        for row in metrics.read(study / "results.jsonl")
+    ]
 
 
 def cells(study):

@@ -21,7 +21,9 @@ from tests.helpers import ROOT
 
 DOCUMENTS = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
 EACH = pytest.mark.parametrize("path", DOCUMENTS, ids=lambda path: path.name)
-COMMAND = re.compile(r"(?:^ {4,}|`|\$\()((?:dgae |python experiments/)[a-z]+(?:\.py)?(?:\\\n|[^`\n])*)", re.MULTILINE)
+COMMAND = re.compile(
+    r"(?:^ {4,}|`|\$\()((?:dgae |python experiments/)[a-z]+(?:\.py)?(?:\\\n|[^`\n])*)", re.MULTILINE
+)
 
 
 def prose(path):
@@ -32,13 +34,19 @@ def prose(path):
 def anchors(path):
     """The names that GitHub gives the headings of a document."""
     headings = re.findall(r"^#+ (.*)$", prose(path), re.MULTILINE)
-    return {re.sub(r"[^\w\- ]", "", heading.lower()).strip().replace(" ", "-") for heading in headings}
+    return {
+        re.sub(r"[^\w\- ]", "", heading.lower()).strip().replace(" ", "-") for heading in headings
+    }
 
 
 def commands(path):
     """Name and words of each command line in a document."""
     for line in COMMAND.findall(path.read_text()):
-        words = [word for word in shlex.split(line.replace("\\\n", " ").replace("…", ""), comments=True) if word]
+        words = [
+            word
+            for word in shlex.split(line.replace("\\\n", " ").replace("…", ""), comments=True)
+            if word
+        ]
         yield (words[1], words[2:]) if words[0] == "dgae" else (Path(words[1]).stem, words[2:])
 
 
@@ -61,7 +69,9 @@ def test_links_lead_to_a_file_and_a_heading_of_it(path):
         name, _, anchor = target.partition("#")
         file = path.parent / name if name else path
         assert file.exists(), target
-        assert path.parent != ROOT / "docs" or not name.startswith(".."), f"{target} is not in the site"
+        assert path.parent != ROOT / "docs" or not name.startswith(".."), (
+            f"{target} is not in the site"
+        )
         assert not anchor or anchor in anchors(file), target
 
 
@@ -74,7 +84,9 @@ def test_the_documents_have_links_with_headings_and_commands_with_flags():
 def test_command_lines_have_flags_that_exist(path):
     for name, words in commands(path):
         assert name in COMMANDS
-        given = [word.partition("=")[0] for word in words if word.startswith("--") and word != "--help"]
+        given = [
+            word.partition("=")[0] for word in words if word.startswith("--") and word != "--help"
+        ]
         assert not [word for word in given if word not in flags(name)], (name, words)
 
 
@@ -94,14 +106,25 @@ def test_the_page_of_settings_is_what_the_dataclasses_say():
 
 
 def test_the_page_of_the_interface_has_every_public_name_once():
-    names = re.findall(r"^::: dgae_jax\.(\w+)$", (ROOT / "docs" / "api.md").read_text(), re.MULTILINE)
+    names = re.findall(
+        r"^::: dgae_jax\.(\w+)$", (ROOT / "docs" / "api.md").read_text(), re.MULTILINE
+    )
     assert sorted(names) == sorted(dgae_jax.__all__)
 
 
 def settings_elsewhere():
     """Cells of the table of settings of other trainers, without its head."""
-    section = (ROOT / "docs" / "coming-from.md").read_text().split("## Settings of PPO\n")[1].split("\n## ")[0]
-    return [[cell.strip() for cell in row.strip("|").split("|")] for row in section.splitlines() if row.startswith("| ")][1:]
+    section = (
+        (ROOT / "docs" / "coming-from.md")
+        .read_text()
+        .split("## Settings of PPO\n")[1]
+        .split("\n## ")[0]
+    )
+    return [
+        [cell.strip() for cell in row.strip("|").split("|")]
+        for row in section.splitlines()
+        if row.startswith("| ")
+    ][1:]
 
 
 def names_in(cell):
@@ -120,7 +143,13 @@ def test_flags_of_the_table_of_other_trainers_exist_and_the_command_line_answers
     assert answered > 15
 
 
-SB3 = ["ppo/ppo.py", "common/policies.py", "common/env_util.py", "common/vec_env/vec_normalize.py", "common/base_class.py"]
+SB3 = [
+    "ppo/ppo.py",
+    "common/policies.py",
+    "common/env_util.py",
+    "common/vec_env/vec_normalize.py",
+    "common/base_class.py",
+]
 REJAX = ["algos/algorithm.py", "algos/mixins.py", "algos/ppo.py"]
 
 
@@ -133,9 +162,20 @@ def test_names_of_the_table_of_other_trainers_are_in_their_sources(column, packa
     folder = Path(find_spec(package).origin).parent
     trees = [ast.parse((folder / file).read_text()) for file in files]
     known = {
-        getattr(node, field) for tree in trees for node in ast.walk(tree) for field in ("arg", "attr", "id", "name") if hasattr(node, field)
+        getattr(node, field)
+        for tree in trees
+        for node in ast.walk(tree)
+        for field in ("arg", "attr", "id", "name")
+        if hasattr(node, field)
     }
-    words = {node.value for tree in trees for node in ast.walk(tree) if isinstance(node, ast.Constant)}
-    names = {name for row in settings_elsewhere() for name in names_in(row[column]) if name not in ("TimeLimit", "VecNormalize")}
+    words = {
+        node.value for tree in trees for node in ast.walk(tree) if isinstance(node, ast.Constant)
+    }
+    names = {
+        name
+        for row in settings_elsewhere()
+        for name in names_in(row[column])
+        if name not in ("TimeLimit", "VecNormalize")
+    }
     assert len(names) > 10
     assert names <= known | words

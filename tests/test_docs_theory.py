@@ -14,8 +14,16 @@ PAPER = ROOT.parent / "shared" / "paper" / "dgae.tex"
 TEXT = (ROOT / "docs" / "theory.md").read_text()
 ROWS = [line.strip("|").split("|") for line in TEXT.splitlines() if line.startswith("| ")][1:]
 LABELS = [label for row in ROWS for label in re.findall(r"`(\w+:\w+)`", row[1])]
-PAIRS = [(name, re.findall(r":(\w+)`", row[1])) for row in ROWS for name in re.findall(r"`([\w.]+)`", row[2])]
-SOURCES = {path: path.read_text() for room in ("maths", "learn") for path in sorted(Path(dgae_jax.__path__[0], room).glob("*.py"))}
+PAIRS = [
+    (name, re.findall(r":(\w+)`", row[1]))
+    for row in ROWS
+    for name in re.findall(r"`([\w.]+)`", row[2])
+]
+SOURCES = {
+    path: path.read_text()
+    for room in ("maths", "learn")
+    for path in sorted(Path(dgae_jax.__path__[0], room).glob("*.py"))
+}
 
 
 def paper():

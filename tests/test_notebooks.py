@@ -8,7 +8,10 @@ import pytest
 from tests.helpers import ROOT
 
 NOTEBOOKS = sorted((ROOT / "notebooks").glob("*.ipynb"))
-CELLS = {path: [(cell, "".join(cell["source"])) for cell in json.loads(path.read_text())["cells"]] for path in NOTEBOOKS}
+CELLS = {
+    path: [(cell, "".join(cell["source"])) for cell in json.loads(path.read_text())["cells"]]
+    for path in NOTEBOOKS
+}
 
 
 def code(path):
@@ -34,11 +37,16 @@ def test_all_begin_with_the_same_set_up_whose_address_is_one_variable():
 
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
 def test_settings_come_from_presets(path):
-    for copied in re.findall(r"\b(num_envs|horizon|minibatches|learning_rate|epochs)=", "\n".join(code(path))):
+    for copied in re.findall(
+        r"\b(num_envs|num_steps|minibatches|learning_rate|epochs)=", "\n".join(code(path))
+    ):
         pytest.fail(f"{copied} belongs to a preset")
 
 
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
 def test_links_lead_somewhere(path):
-    for target in re.findall(r"\]\((?!https?:)([^)#]+)", "\n".join(text for cell, text in CELLS[path] if cell["cell_type"] == "markdown")):
+    for target in re.findall(
+        r"\]\((?!https?:)([^)#]+)",
+        "\n".join(text for cell, text in CELLS[path] if cell["cell_type"] == "markdown"),
+    ):
         assert (path.parent / target).exists(), target

@@ -26,7 +26,9 @@ def fail(mistake: Exception | str) -> NoReturn:
     message, setting = str(mistake), getattr(mistake, "setting", None)
     if setting and message.startswith(setting):
         message = flag(setting) + message[len(setting) :]
-    shown = "".join(c if c.isprintable() else ascii(c)[1:-1] for c in message)  # one line, whatever was typed
+    shown = "".join(
+        c if c.isprintable() else ascii(c)[1:-1] for c in message
+    )  # one line, whatever was typed
     terminal.warn(f"error: {shown}")
     raise SystemExit(2)
 
@@ -53,7 +55,12 @@ def peek(argv: Sequence[str], *names: str) -> dict[str, str | None]:
 
 
 def parse(
-    cls: type[T], purpose: str, argv: Sequence[str] | None = None, default: T | None = None, examples: Sequence[str] = (), note: str = ""
+    cls: type[T],
+    purpose: str,
+    argv: Sequence[str] | None = None,
+    default: T | None = None,
+    examples: Sequence[str] = (),
+    note: str = "",
 ) -> T:
     """The dataclass `cls` filled from the command line, over `default`.
 
@@ -66,27 +73,44 @@ def parse(
 
 
 def parse_known(
-    cls: type[T], purpose: str, argv: Sequence[str], examples: Sequence[str] = (), note: str = "", rest: Sequence[type] = ()
+    cls: type[T],
+    purpose: str,
+    argv: Sequence[str],
+    examples: Sequence[str] = (),
+    note: str = "",
+    rest: Sequence[type] = (),
 ) -> tuple[T, list[str]]:
     """`parse` for a command line that says more: the dataclass, and the words that are of the dataclasses `rest`."""
     ours = list(leaves(cls))
-    _refuse_unknown(argv, [*ours, *(leaf for other in rest for leaf in leaves(other))], refuse_foreign)
+    _refuse_unknown(
+        argv, [*ours, *(leaf for other in rest for leaf in leaves(other))], refuse_foreign
+    )
     with _understandable(ours, argv, examples, note):
-        parsed, words = tyro.cli(view(ours), description=purpose, args=argv, return_unknown_args=True)
+        parsed, words = tyro.cli(
+            view(ours), description=purpose, args=argv, return_unknown_args=True
+        )
     return built(cls, parsed), words
 
 
-def _refuse_unknown(argv: Sequence[str], listed: Sequence[Leaf], foreign: Callable[[str], None] = lambda _: None) -> None:
+def _refuse_unknown(
+    argv: Sequence[str], listed: Sequence[Leaf], foreign: Callable[[str], None] = lambda _: None
+) -> None:
     """Raise ConfigError for a flag that there is not; tyro's flags for completion know one command only, and may end in a stack trace."""
     word = mistakes.unknown(argv, listed)
     if word is None or {"-h", "--help"}.intersection(argv):
         return
     foreign(word)
-    raise ConfigError(f"{word}: is written dgae --completion SHELL" if word.startswith("--tyro") else mistakes.not_a_flag(word, listed))
+    raise ConfigError(
+        f"{word}: is written dgae --completion SHELL"
+        if word.startswith("--tyro")
+        else mistakes.not_a_flag(word, listed)
+    )
 
 
 @contextlib.contextmanager
-def _understandable(listed: Sequence[Leaf], argv: Sequence[str], examples: Sequence[str], note: str) -> Iterator[None]:
+def _understandable(
+    listed: Sequence[Leaf], argv: Sequence[str], examples: Sequence[str], note: str
+) -> Iterator[None]:
     """The help with an ending, and a mistake in one line."""
     tyro._experimental_options["ansi_codes"] = not os.environ.get("NO_COLOR")
     screen = io.StringIO()

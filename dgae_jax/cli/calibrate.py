@@ -12,8 +12,9 @@ import tyro
 
 from dgae_jax.cli.arguments import fail, parse, stopped
 from dgae_jax.cli.source import check_file, check_index, check_seed
-from dgae_jax.configs.config import Config, ConfigError, invalid, resolve
+from dgae_jax.configs.config import ConfigError, invalid
 from dgae_jax.configs.parts import is_distribution
+from dgae_jax.configs.resolved import ResolvedConfig
 from dgae_jax.run import directory, files, terminal
 from dgae_jax.run.options import RunOptions
 
@@ -32,8 +33,8 @@ class Arguments:
 
     run_dirs: tyro.conf.Positional[tuple[Path, ...]]
     """Directories of runs, or files of dgae refit and of policies [paths]."""
-    checkpoint: Literal["newest", "best"] = "newest"
-    """newest, or best: of the evaluations while it trained."""
+    checkpoint: Literal["latest", "best"] = "latest"
+    """latest, or best: of the evaluations while it trained."""
     index: int = 0
     """Which of the seeds that were trained side by side, from 0."""
     seed: int = 0
@@ -57,14 +58,16 @@ def main() -> int:
         return stopped("stopped by SIGINT")
 
 
-def _checked(arguments: Arguments) -> tuple[dict[Path, Config], Path]:
+def _checked(arguments: Arguments) -> tuple[dict[Path, ResolvedConfig], Path]:
     """The runs, and the picture to write; raises ConfigError for the first thing that is invalid."""
     if not arguments.run_dirs:
         raise ConfigError("RUN_DIRS: must be one run directory or more (--help lists every flag)")
     names = [path.resolve().name for path in arguments.run_dirs]
     if len(set(names)) < len(names):
-        raise ConfigError(f"RUN_DIRS {' '.join(names)}: must be of different names, by which their statistics are known")
-    runs = {path: resolve(directory.config_of(path)) for path in arguments.run_dirs}
+        raise ConfigError(
+            f"RUN_DIRS {' '.join(names)}: must be of different names, by which their statistics are known"
+        )
+    runs = {path: (directory.config_of(path)) for path in arguments.run_dirs}
     for path, config in runs.items():
         if not is_distribution(str(config.critic.kind)):
             raise ConfigError(f"{path}: must be a run with a value distribution, not {config.algo}")
@@ -78,7 +81,7 @@ def _checked(arguments: Arguments) -> tuple[dict[Path, Config], Path]:
     return runs, out
 
 
-def _calibrate(arguments: Arguments, runs: dict[Path, Config], out: Path) -> int:
+def _calibrate(arguments: Arguments, runs: dict[Path, ResolvedConfig], out: Path) -> int:
     from dgae_jax.report import calibration as picture
     from dgae_jax.run import calibration, curve, machine, outcomes
     from dgae_jax.run.progress import Reporter
@@ -87,7 +90,10 @@ def _calibrate(arguments: Arguments, runs: dict[Path, Config], out: Path) -> int
     machine.use_cache(arguments.cache_dir)
     for config in runs.values():
         outcomes.check(config)
-    found, how = {}, {"which": arguments.checkpoint, "index": arguments.index, "seed": arguments.seed}
+    found, how = (
+        {},
+        {"which": arguments.checkpoint, "index": arguments.index, "seed": arguments.seed},
+    )
     for path, config in runs.items():
         with Reporter() as reporter:
             result = calibration.calibrate(path, config, **how, watch=reporter.watch)
@@ -107,7 +113,9 @@ def _write(path: Path, write) -> None:
     try:
         write(path)
     except OSError as reason:
-        raise ConfigError(f"{path}: must be a file that can be written ({reason.strerror})") from reason
+        raise ConfigError(
+            f"{path}: must be a file that can be written ({reason.strerror})"
+        ) from reason
 
 
 if __name__ == "__main__":

@@ -8,18 +8,18 @@ from typing import Annotated, Any, Literal, Union, get_origin
 import tyro
 
 from dgae_jax.cli.flags import Leaf, leaves, view
-from dgae_jax.configs.algorithms import TABLE
-from dgae_jax.configs.config import Config, flag, invalid, task_spec
+from dgae_jax.configs.algorithms import ALGORITHMS
+from dgae_jax.configs.config import Config, flag, invalid
 from dgae_jax.configs.parts import CRITICS, UPDATES
 from dgae_jax.configs.presets import PRESETS
-from dgae_jax.configs.validation import CHOICES
+from dgae_jax.configs.validation import CHOICES, task_spec
 from dgae_jax.envs.registry import TASKS
 from dgae_jax.physics.registry import ENGINES
 from dgae_jax.run.options import SINKS
 from dgae_jax.study.launch import LAUNCHERS
 
 NAMES = {
-    "preset": PRESETS, "env": TASKS, "envs": TASKS, "env_version": task_spec(Config()).versions, "algo": TABLE, "algos": TABLE,
+    "preset": PRESETS, "env": TASKS, "envs": TASKS, "env_version": task_spec(Config()).versions, "algo": ALGORITHMS, "algos": ALGORITHMS,
     "physics": ENGINES, "policy.update": UPDATES, "critic.kind": CRITICS, "log": SINKS, "launcher": LAUNCHERS, **CHOICES,
 }  # fmt: skip
 """Settings that take a name, and the table that it is of."""
@@ -49,7 +49,10 @@ def script(shell: str, commands: dict[str, str]) -> str:
     if shell not in FILES:
         raise invalid("completion", shell or "nothing", f"one of {', '.join(FILES)}")
     kinds = [
-        Annotated[view(map(_with_choices, leaves_of(name))), tyro.conf.subcommand(name, description=purpose)]
+        Annotated[
+            view(map(_with_choices, leaves_of(name))),
+            tyro.conf.subcommand(name, description=purpose),
+        ]
         for name, purpose in commands.items()
     ]
     either: Any = Union[tuple(kinds)]  # noqa: UP007
@@ -71,4 +74,6 @@ def _with_choices(leaf: Leaf) -> Leaf:
     names = _CHOICES.get(leaf.flag)
     if names is None:
         return leaf
-    return leaf._replace(hint=tuple[Literal[names], ...] if get_origin(leaf.hint) is tuple else Literal[names])
+    return leaf._replace(
+        hint=tuple[Literal[names], ...] if get_origin(leaf.hint) is tuple else Literal[names]
+    )

@@ -35,8 +35,8 @@ class Arguments:
     engine: Literal["gymnasium", "native", "jax", "mjx", "mjx-warp"] | None = None
     """gymnasium (the task of the gymnasium package), or an engine as in --physics of the training; by default the first that the
     run can have."""
-    checkpoint: Literal["newest", "best"] = "newest"
-    """newest, or best: of the evaluations while it trained, whose episodes chose it; take another --seed to judge it."""
+    checkpoint: Literal["latest", "best"] = "latest"
+    """latest, or best: of the evaluations while it trained, whose episodes chose it; take another --seed to judge it."""
     episodes: int = 20
     """Episodes per trained run [episodes]."""
     seed: int = 0
@@ -65,7 +65,9 @@ def _check(arguments: Arguments) -> None:
     """Raise ConfigError for the first argument that is invalid."""
     low, high, reason = WHOLE["episodes"]
     if not low <= arguments.episodes <= high:
-        raise invalid("episodes", arguments.episodes, f"a whole number from {low:,} to {high:,} ({reason})")
+        raise invalid(
+            "episodes", arguments.episodes, f"a whole number from {low:,} to {high:,} ({reason})"
+        )
     check_seed(arguments.seed)
 
 
@@ -80,7 +82,12 @@ def _evaluate(arguments: Arguments) -> int:
     check_file(out)
     machine.use_devices(config, RunOptions(devices=1, num_processes=1))
     machine.use_cache(arguments.cache_dir)
-    how = {"which": arguments.checkpoint, "engine": engine, "episodes": arguments.episodes, "seed": arguments.seed}
+    how = {
+        "which": arguments.checkpoint,
+        "engine": engine,
+        "episodes": arguments.episodes,
+        "seed": arguments.seed,
+    }
     with Reporter() as reporter:
         result = evaluation.evaluate_run(arguments.run_dir, config, **how, watch=reporter.watch)
     try:

@@ -12,7 +12,8 @@ import tyro
 
 from dgae_jax.cli.arguments import fail, parse, stopped
 from dgae_jax.cli.source import check_directory, check_index
-from dgae_jax.configs.config import Config, ConfigError, invalid, resolve
+from dgae_jax.configs.config import ConfigError, invalid
+from dgae_jax.configs.resolved import ResolvedConfig
 from dgae_jax.envs.registry import spec_of
 from dgae_jax.export import graph
 from dgae_jax.run import directory, files, terminal
@@ -36,8 +37,8 @@ class Arguments:
     to: tuple[Literal["npz", "onnx", "gymnasium"], ...]
     """One or more of npz (arrays and a program of NumPy alone), onnx (a model for ONNX Runtime and others) and gymnasium (a program
     that plays the task without JAX); each becomes a directory of its own."""
-    checkpoint: Literal["newest", "best"] = "newest"
-    """newest, or best: of the evaluations while it trained."""
+    checkpoint: Literal["latest", "best"] = "latest"
+    """latest, or best: of the evaluations while it trained."""
     index: int = 0
     """Which of the seeds that were trained side by side, from 0."""
     out: Path | None = None
@@ -58,31 +59,37 @@ def main() -> int:
         return stopped("stopped by SIGINT")
 
 
-def _checked(arguments: Arguments) -> tuple[Config, Path]:
+def _checked(arguments: Arguments) -> tuple[ResolvedConfig, Path]:
     """The run's configuration and the directory to write in; raises ConfigError for the first argument that is invalid."""
     if not arguments.to:
         raise invalid("to", "nothing", "one or more of npz, onnx, gymnasium")
     if "onnx" in arguments.to:
         graph.check_extra()
-    config = resolve(directory.config_of(arguments.run_dir))
+    config = directory.config_of(arguments.run_dir)
     check_index(arguments.index, config, arguments.run_dir)
     if "gymnasium" in arguments.to and spec_of(config.env).referee() is None:
-        raise invalid("to", "gymnasium", f"left out with {config.env}, which Gymnasium does not play")
+        raise invalid(
+            "to", "gymnasium", f"left out with {config.env}, which Gymnasium does not play"
+        )
     out = arguments.out or files.beside(arguments.run_dir, "export")
     check_directory(out)
     return config, out
 
 
-def _export(arguments: Arguments, config: Config, out: Path) -> int:
+def _export(arguments: Arguments, config: ResolvedConfig, out: Path) -> int:
     from dgae_jax.export import bundle
     from dgae_jax.run import machine
 
     machine.use_devices(config, RunOptions(devices=1, num_processes=1))
     formats = list(dict.fromkeys(arguments.to))
     try:
-        written = bundle.export(arguments.run_dir, config, arguments.checkpoint, arguments.index, formats, out)
+        written = bundle.export(
+            arguments.run_dir, config, arguments.checkpoint, arguments.index, formats, out
+        )
     except OSError as reason:
-        raise invalid("out", out, f"a directory that can be written ({reason.strerror})") from reason
+        raise invalid(
+            "out", out, f"a directory that can be written ({reason.strerror})"
+        ) from reason
     for kind, names in written.items():
         terminal.say(f"written to {out / kind}: {', '.join(names)}")
     return 0

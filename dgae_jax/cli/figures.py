@@ -32,7 +32,10 @@ class Drawing(NamedTuple):
     """Whether MuJoCo draws in it."""
 
 
-FIGURES = {"robots": Drawing(("png",), opengl=True), "transport": Drawing(("png", "svg"), opengl=False)}
+FIGURES = {
+    "robots": Drawing(("png",), opengl=True),
+    "transport": Drawing(("png", "svg"), opengl=False),
+}
 
 
 @dataclass(frozen=True)
@@ -72,7 +75,9 @@ def _draw(chosen: dict[str, Drawing], out: Path) -> None:
                 pictures.save(figure, out / f"{name}.{kind}")
                 terminal.say(f"written to {out / name}.{kind}")
     except OSError as reason:
-        raise invalid("out", out, f"a directory that can be written ({reason.strerror})") from reason
+        raise invalid(
+            "out", out, f"a directory that can be written ({reason.strerror})"
+        ) from reason
 
 
 if __name__ == "__main__":

@@ -17,7 +17,10 @@ SECONDS = "8"
 
 def typical(rows: list[Row]) -> Row:
     """Of the algorithm with the highest mean return the seed in the middle, the better of two."""
-    algo = max(sorted({row.algo for row in rows}), key=lambda algo: np.mean([row.final for row in rows if row.algo == algo]))
+    algo = max(
+        sorted({row.algo for row in rows}),
+        key=lambda algo: np.mean([row.final for row in rows if row.algo == algo]),
+    )
     ordered = sorted((row for row in rows if row.algo == algo), key=lambda row: row.final)
     return ordered[len(ordered) // 2]
 
@@ -36,11 +39,28 @@ def make(study: Study) -> list[Path]:
             raise invalid("videos", True, f"left out: the runs of {study.path} are not here")
         stem.parent.mkdir(exist_ok=True)
         index = chosen.seed - int(chosen.config["seed"])
-        words = [str(run_dir), "--out", str(stem), "--format", "mp4", "--seconds", SECONDS, "--index", str(index)]
+        words = [
+            str(run_dir),
+            "--out",
+            str(stem),
+            "--format",
+            "mp4",
+            "--seconds",
+            SECONDS,
+            "--index",
+            str(index),
+        ]
         terminal.say(f"filming {chosen.cell}")
         # a process of its own: the OpenGL to draw with is chosen before MuJoCo is loaded
-        done = subprocess.run([sys.executable, "-m", "dgae_jax.cli.render", *words], capture_output=True, text=True, check=False)
+        done = subprocess.run(
+            [sys.executable, "-m", "dgae_jax.cli.render", *words],
+            capture_output=True,
+            text=True,
+            check=False,
+        )
         if done.returncode:
-            raise ConfigError(f"videos: must be left out: {done.stderr.strip().removeprefix('error: ')}", "videos")
+            raise ConfigError(
+                f"videos: must be left out: {done.stderr.strip().removeprefix('error: ')}", "videos"
+            )
         written.append(stem.with_name(f"{stem.name}.mp4"))
     return written

@@ -22,16 +22,33 @@ Route = tuple[str, ...]
 GROUPS = {
     "task": ("env", "env_version", "physics", "episode_length"),
     "noise": (),
-    "algorithm": ("algo", "gamma", "lam", "residual", "metric", "normalize_observations", "normalize_rewards"),
-    "rollout": ("total_steps", "num_envs", "horizon", "seed", "num_seeds"),
+    "algorithm": (
+        "algo",
+        "gamma",
+        "lam",
+        "residual",
+        "metric",
+        "normalize_observations",
+        "normalize_rewards",
+    ),
+    "rollout": ("total_steps", "num_envs", "num_steps", "seed", "num_seeds"),
     "policy": (),
     "critic": (),
-    "run": ("run_dir", "resume", "resume_or_start", "inexact", "checkpoint_every", "keep_checkpoints", "log", "cache_dir"),
+    "run": (
+        "run_dir",
+        "resume",
+        "resume_or_start",
+        "inexact",
+        "checkpoint_every",
+        "keep_checkpoints",
+        "log",
+        "cache_dir",
+    ),
     "evaluation": ("eval_engine", "episodes"),
     "device": ("devices", "coordinator", "num_processes", "process_id"),
     "diagnostics": ("diagnostics", "max_nonfinite", "debug_nonfinite"),
 }
-"""Headings of the help, in order, and the settings below them; what is in a dataclass of its own (policy.clip) is below its name."""
+"""Headings of the help, in order, and the settings below them; what is in a dataclass of its own (policy.clip_eps) is below its name."""
 
 _GROUP_OF = {setting: group for group, settings in GROUPS.items() for setting in settings}
 
@@ -69,12 +86,16 @@ def leaves(cls: type, default: Any = None, route: Route = (), prefix: str = "") 
     for f in fields(cls):
         hint, here, value = hints[f.name], (*route, f.name), _default(f, default)
         if is_dataclass(plain[f.name]):
-            inside = "" if get_origin(hint) is Annotated else f"{prefix}{f.name}."  # annotated with an empty name
+            inside = (
+                "" if get_origin(hint) is Annotated else f"{prefix}{f.name}."
+            )  # annotated with an empty name
             yield from leaves(plain[f.name], None if value is MISSING else value, here, inside)
         else:
             group = _GROUP_OF.get(f.name, route[-1]) if route and not prefix else prefix.rstrip(".")
             about = cls.__doc__ or "" if group not in _GROUP_OF.values() and route else ""
-            yield Leaf(here, flag(prefix + f.name)[2:], group, about, hint, texts.get(f.name, ""), value)
+            yield Leaf(
+                here, flag(prefix + f.name)[2:], group, about, hint, texts.get(f.name, ""), value
+            )
 
 
 def _default(f: Any, default: Any) -> Any:
@@ -102,7 +123,13 @@ def view(listed: Iterable[Leaf]) -> type:
     for name, inside in groups.items():
         if inside:
             group = make_dataclass(name, map(_member, inside), kw_only=True, frozen=True)
-            members.append((name, Annotated[group, tyro.conf.arg(help=inside[0].about)], field(default_factory=group)))
+            members.append(
+                (
+                    name,
+                    Annotated[group, tyro.conf.arg(help=inside[0].about)],
+                    field(default_factory=group),
+                )
+            )
     return make_dataclass("Arguments", members, kw_only=True, frozen=True)
 
 
@@ -111,11 +138,15 @@ def _member(leaf: Leaf) -> tuple[str, Any, Any]:
     shown = tyro.conf.arg(
         name=leaf.flag, prefix_name=False, help=leaf.text, metavar=metavar(leaf.hint, named), help_behavior_hint=_hint(leaf.default),
     )  # fmt: skip
-    return leaf.attribute, Annotated[leaf.hint, shown], field() if leaf.default is MISSING else field(default=leaf.default)
+    return (
+        leaf.attribute,
+        Annotated[leaf.hint, shown],
+        field() if leaf.default is MISSING else field(default=leaf.default),
+    )
 
 
 def metavar(hint: Any, named: str = "") -> str | None:
-    """What stands for the value of a flag: INT, PATH, {newest,best}, or INT ... for several; None where the flag has no value."""
+    """What stands for the value of a flag: INT, PATH, {latest,best}, or INT ... for several; None where the flag has no value."""
     origin, inside = get_origin(hint), get_args(hint)
     if origin is Annotated:
         return metavar(inside[0], named)
@@ -159,5 +190,10 @@ def _built(cls: type, values: Mapping[str, Any], route: Route) -> Any:
     hints = get_type_hints(cls)
     inside = {f.name: (*route, f.name) for f in fields(cls)}
     return cls(
-        **{name: _built(hints[name], values, at) if is_dataclass(hints[name]) else values["_".join(at)] for name, at in inside.items()}
+        **{
+            name: _built(hints[name], values, at)
+            if is_dataclass(hints[name])
+            else values["_".join(at)]
+            for name, at in inside.items()
+        }
     )

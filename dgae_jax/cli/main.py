@@ -62,7 +62,9 @@ def main() -> int:
         return 0
     if name == "--version":
         versions = ", ".join(f"{library} {metadata.version(library)}" for library in LIBRARIES)
-        terminal.say(f"dgae_jax {dgae_jax.__version__}\nPython {platform.python_version()}, {versions}")
+        terminal.say(
+            f"dgae_jax {dgae_jax.__version__}\nPython {platform.python_version()}, {versions}"
+        )
         return 0
     if name.partition("=")[0] == "--completion":
         return _completion(name.partition("=")[2] or "".join(words[1:2]))

@@ -11,7 +11,11 @@ from itertools import pairwise
 
 from dgae_jax.cli.flags import Leaf, metavar
 
-KINDS = {"INT": "a whole number", "FLOAT": "a number", "INT ...": "whole numbers with spaces between them"}
+KINDS = {
+    "INT": "a whole number",
+    "FLOAT": "a number",
+    "INT ...": "whole numbers with spaces between them",
+}
 """What a value must be that could not be read."""
 
 _FRAME = re.compile(r"[╭╮╰╯├┤│─+|\- ]*")  # tyro draws it in ASCII where the terminal has no more
@@ -24,28 +28,50 @@ def sentence(box: str, listed: Sequence[Leaf], argv: Sequence[str]) -> str:
     if found := re.match(r"Unrecognized options: (.*?)(, | Perhaps|$)", text):
         return _stray(found[1], by_flag, argv)
     if found := re.match(r"Missing value for argument '(\S+)'", text):
-        return f"{found[1]}: must be followed by a value" if found[1] in by_flag else f"{_upper(found[1])}: must be given"
+        return (
+            f"{found[1]}: must be followed by a value"
+            if found[1] in by_flag
+            else f"{_upper(found[1])}: must be given"
+        )
     if text.startswith("Missing from"):
-        needed = next(leaf for leaf in listed if leaf.default is MISSING and (_upper(leaf.flag) if leaf.positional else leaf.flag) in text)
+        needed = next(
+            leaf
+            for leaf in listed
+            if leaf.default is MISSING
+            and (_upper(leaf.flag) if leaf.positional else leaf.flag) in text
+        )
         return f"{_upper(needed.flag) if needed.positional else '--' + needed.flag}: must be given"
     if found := re.search(r"for argument '(\S+)'\. Expected one of \((.*?),?\)", text):
         allowed = ", ".join(name for name in re.findall(r"'(.*?)'", found[2]) if name != "None")
         return f"{found[1]} {' '.join(_values(found[1], argv))}: must be one of {allowed}"
-    if (found := re.match(r"Error parsing (\S+):", text)) and (kind := KINDS.get(metavar(by_flag[found[1]].hint) or "")):
+    if (found := re.match(r"Error parsing (\S+):", text)) and (
+        kind := KINDS.get(metavar(by_flag[found[1]].hint) or "")
+    ):
         return f"{found[1]} {' '.join(_values(found[1], argv))}: must be {kind}"
     return text
 
 
 def names(listed: Sequence[Leaf]) -> list[str]:
     """All flags."""
-    both = [("--" + leaf.flag, "--no-" + leaf.flag) if leaf.hint is bool else ("--" + leaf.flag,) for leaf in listed if not leaf.positional]
+    both = [
+        ("--" + leaf.flag, "--no-" + leaf.flag) if leaf.hint is bool else ("--" + leaf.flag,)
+        for leaf in listed
+        if not leaf.positional
+    ]
     return ["--help", *(name for pair in both for name in pair)]
 
 
 def unknown(argv: Sequence[str], listed: Sequence[Leaf]) -> str | None:
     """The first word that looks like a flag and is none."""
     known = names(listed)
-    return next((word for word in argv if word.startswith("--") and word != "--" and flag_of(word) not in known), None)
+    return next(
+        (
+            word
+            for word in argv
+            if word.startswith("--") and word != "--" and flag_of(word) not in known
+        ),
+        None,
+    )
 
 
 def not_a_flag(word: str, listed: Sequence[Leaf]) -> str:
@@ -93,6 +119,10 @@ def _until_a_flag(words: Sequence[str]) -> Iterator[str]:
 
 def _inside(box: str) -> str:
     """The sentence inside tyro's framed message, without title, frame and pointer to the help text."""
-    lines = [line.strip().strip("│|").strip() for line in box.splitlines()[1:] if not _FRAME.fullmatch(line.strip())]
+    lines = [
+        line.strip().strip("│|").strip()
+        for line in box.splitlines()[1:]
+        if not _FRAME.fullmatch(line.strip())
+    ]
     body = " ".join(line for line in lines if line).partition("For full helptext")[0]
     return re.sub(r"\s+", " ", body).strip()

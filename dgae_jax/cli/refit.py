@@ -1,4 +1,4 @@
-"""Fit a value distribution to a policy that is held fixed: dgae refit RUN_DIR
+"""TrainableState a value distribution to a policy that is held fixed: dgae refit RUN_DIR
 
 Flags are checked before the rest is imported: JAX, MuJoCo and Brax take seconds to load.
 """
@@ -12,11 +12,12 @@ import tyro
 
 from dgae_jax.cli.arguments import fail, parse, stopped
 from dgae_jax.cli.source import check_file, check_index, check_seed
-from dgae_jax.configs.config import Config, ConfigError, invalid, resolve
+from dgae_jax.configs.config import ConfigError, invalid
+from dgae_jax.configs.resolved import ResolvedConfig
 from dgae_jax.run import directory, files, terminal
 from dgae_jax.run.options import RunOptions
 
-PURPOSE = "Fit a value distribution to the returns of a policy held fixed."
+PURPOSE = "TrainableState a value distribution to the returns of a policy held fixed."
 
 EXAMPLES = (
     "dgae refit runs/first",
@@ -33,8 +34,8 @@ class Arguments:
 
     run_dir: tyro.conf.Positional[Path]
     """Directory of the run, or the file of a policy [path]."""
-    checkpoint: Literal["newest", "best"] = "newest"
-    """newest, or best: of the evaluations while it trained."""
+    checkpoint: Literal["latest", "best"] = "latest"
+    """latest, or best: of the evaluations while it trained."""
     index: int = 0
     """Which of the seeds that were trained side by side, from 0."""
     worlds: int = 128
@@ -49,7 +50,7 @@ class Arguments:
 
 
 def main() -> int:
-    """Fit one critic; 0 done, 2 bad input, 130 stopped by SIGINT."""
+    """TrainableState one critic; 0 done, 2 bad input, 130 stopped by SIGINT."""
     terminal.prepare()
     try:
         arguments = parse(Arguments, PURPOSE, examples=EXAMPLES)
@@ -60,35 +61,46 @@ def main() -> int:
         return stopped("stopped by SIGINT, nothing written")
 
 
-def _checked(arguments: Arguments) -> tuple[Config, Path]:
+def _checked(arguments: Arguments) -> tuple[ResolvedConfig, Path]:
     """The run's configuration and the file to write; raises ConfigError for the first argument that is invalid."""
     if not 1 <= arguments.worlds <= MOST_WORLDS:
         raise invalid("worlds", arguments.worlds, f"a whole number from 1 to {MOST_WORLDS:,}")
     check_seed(arguments.seed)
-    config = resolve(directory.config_of(arguments.run_dir))
+    config = directory.config_of(arguments.run_dir)
     check_index(arguments.index, config, arguments.run_dir)
     out = arguments.out or files.beside(arguments.run_dir, "refit.msgpack")
     check_file(out)
     own = out.exists() and out.samefile(arguments.run_dir)
     if out.suffix != ".msgpack" or own or out.absolute().parent.name == "checkpoints":
-        raise invalid("out", out, "a file whose name ends in .msgpack, not the policy's own and not among the checkpoints of a run")
+        raise invalid(
+            "out",
+            out,
+            "a file whose name ends in .msgpack, not the policy's own and not among the checkpoints of a run",
+        )
     return config, out
 
 
-def _refit(arguments: Arguments, config: Config, out: Path) -> int:
+def _refit(arguments: Arguments, config: ResolvedConfig, out: Path) -> int:
     from dgae_jax.run import machine, refit, restore
     from dgae_jax.run.progress import Reporter
 
     machine.use_devices(config, RunOptions(devices=1, num_processes=1))
     machine.use_cache(arguments.cache_dir)
-    how = {"which": arguments.checkpoint, "index": arguments.index, "seed": arguments.seed, "worlds": arguments.worlds}
+    how = {
+        "which": arguments.checkpoint,
+        "index": arguments.index,
+        "seed": arguments.seed,
+        "worlds": arguments.worlds,
+    }
     with Reporter() as reporter:
         found = refit.refit(arguments.run_dir, config, **how, watch=reporter.watch)
     try:
         restore.save_networks(out, found.config, found.networks, found.std)
     except OSError as reason:
         raise invalid("out", out, f"a file that can be written ({reason.strerror})") from reason
-    terminal.say(f"fitted to {found.returns:,} returns with a standard deviation of {found.std[0]:,.1f}; written to {out}")
+    terminal.say(
+        f"fitted to {found.returns:,} returns with a standard deviation of {found.std[0]:,.1f}; written to {out}"
+    )
     return 0
 
 

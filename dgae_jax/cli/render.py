@@ -12,7 +12,8 @@ import tyro
 
 from dgae_jax.cli.arguments import fail, parse, stopped
 from dgae_jax.cli.source import check_file, check_index
-from dgae_jax.configs.config import Config, ConfigError, invalid, resolve
+from dgae_jax.configs.config import ConfigError, invalid
+from dgae_jax.configs.resolved import ResolvedConfig
 from dgae_jax.envs.registry import TASKS, spec_of
 from dgae_jax.export import gl, video
 from dgae_jax.run import directory, files, terminal
@@ -35,8 +36,8 @@ class Arguments:
     """Directory of the run, or the file of dgae refit [path]."""
     compare: tuple[Path, ...] = ()
     """Further runs from the same initial states, shown beside it, from four on in a square [paths]."""
-    checkpoint: Literal["newest", "best"] | None = None
-    """newest, or best: of the evaluations while it trained; by default newest."""
+    checkpoint: Literal["latest", "best"] | None = None
+    """latest, or best: of the evaluations while it trained; by default latest."""
     during: bool = False
     """The policy at each checkpoint that the run keeps, one after the other, so that one sees it learn."""
     index: int = 0
@@ -81,7 +82,9 @@ def main() -> int:
     try:
         arguments = parse(Arguments, PURPOSE, examples=EXAMPLES)
         _check(arguments)
-        configs = [_config(path, arguments.index) for path in (arguments.run_dir, *arguments.compare)]
+        configs = [
+            _config(path, arguments.index) for path in (arguments.run_dir, *arguments.compare)
+        ]
         _check_out(arguments)
         gl.choose()
         return _render(arguments, configs)
@@ -102,7 +105,11 @@ def _check(arguments: Arguments) -> None:
         raise invalid("seconds", arguments.seconds, f"a number above 0, up to {LONGEST:g}")
     for other in ("compare", "checkpoint"):
         if arguments.during and getattr(arguments, other):
-            raise invalid(other, getattr(arguments, other), "left out with --during, which shows every checkpoint of one run")
+            raise invalid(
+                other,
+                getattr(arguments, other),
+                "left out with --during, which shows every checkpoint of one run",
+            )
     if arguments.during and arguments.run_dir.is_file():
         raise ConfigError(f"--during: must be left out with {arguments.run_dir}, a single policy")
     if "mp4" in video.FORMATS[arguments.format]:
@@ -115,11 +122,13 @@ def _check_out(arguments: Arguments) -> None:
         check_file(stem.with_name(f"{stem.name}.{kind}"))
 
 
-def _config(path: Path, index: int) -> Config:
+def _config(path: Path, index: int) -> ResolvedConfig:
     """The configuration of a run that Gymnasium can play."""
-    config = resolve(directory.config_of(path))
+    config = directory.config_of(path)
     if not spec_of(config.env).referees:
-        raise ConfigError(f"{path}: must be a run of {', '.join(TASKS)}, which can be filmed; it is one of {config.env}")
+        raise ConfigError(
+            f"{path}: must be a run of {', '.join(TASKS)}, which can be filmed; it is one of {config.env}"
+        )
     check_index(index, config, path)
     return config
 
@@ -127,8 +136,14 @@ def _config(path: Path, index: int) -> Config:
 def _stem(arguments: Arguments) -> Path:
     """The file to write, without its ending."""
     if arguments.out is None:
-        kinds = {"during": arguments.during, "compare": arguments.compare, "best": arguments.checkpoint == "best"}
-        return files.beside(arguments.run_dir, "-".join(["film", *(kind for kind, is_so in kinds.items() if is_so)]))
+        kinds = {
+            "during": arguments.during,
+            "compare": arguments.compare,
+            "best": arguments.checkpoint == "best",
+        }
+        return files.beside(
+            arguments.run_dir, "-".join(["film", *(kind for kind, is_so in kinds.items() if is_so)])
+        )
     out = arguments.out
     return out.with_suffix("") if out.suffix in (".mp4", ".gif") else out
 
@@ -139,7 +154,7 @@ def _titles(paths: list[Path]) -> list[str]:
     return names if len(set(names)) == len(names) else [str(path) for path in paths]
 
 
-def _render(arguments: Arguments, configs: list[Config]) -> int:
+def _render(arguments: Arguments, configs: list[ResolvedConfig]) -> int:
     from dgae_jax.export import episodes, film
     from dgae_jax.run import machine
     from dgae_jax.run.progress import Reporter
@@ -152,14 +167,16 @@ def _render(arguments: Arguments, configs: list[Config]) -> int:
         scenes = episodes.of_checkpoints(arguments.run_dir, configs[0], arguments.index, shots)
     else:
         runs = list(zip(_titles(paths), paths, configs, strict=True))
-        scenes = episodes.of_runs(runs, arguments.checkpoint or "newest", arguments.index, shots)
+        scenes = episodes.of_runs(runs, arguments.checkpoint or "latest", arguments.index, shots)
     stem, size = _stem(arguments), film.Size(arguments.width, arguments.height)
     with Reporter() as reporter:
         frames = film.film(scenes, size, arguments.fps, reporter.watch)
         try:
             written = video.write(frames, stem, video.FORMATS[arguments.format], arguments.fps)
         except OSError as reason:
-            raise invalid("out", stem, f"a file that can be written ({reason.strerror})") from reason
+            raise invalid(
+                "out", stem, f"a file that can be written ({reason.strerror})"
+            ) from reason
     for path in written:
         terminal.say(f"written to {path} ({path.stat().st_size / 1e6:.1f} MB)")
     return 0

@@ -57,7 +57,9 @@ def _report(arguments: Arguments) -> int:
     from dgae_jax.report import published, results
 
     if not arguments.studies:
-        raise ConfigError("STUDIES: must be the directory of one study or more (--help lists every flag)")
+        raise ConfigError(
+            "STUDIES: must be the directory of one study or more (--help lists every flag)"
+        )
     if arguments.markdown and len(arguments.studies) > 1:
         raise invalid("markdown", arguments.markdown, "left out where several studies are compared")
     studies = [results.read(path) for path in arguments.studies]
@@ -75,7 +77,9 @@ def _report(arguments: Arguments) -> int:
     for path in write.write(studies, out, known):
         terminal.say(f"written {path}")
     if arguments.markdown:
-        names = markdown.replace(arguments.markdown, groups.groups_of(studies[0].rows), studies[0].name)
+        names = markdown.replace(
+            arguments.markdown, groups.groups_of(studies[0].rows), studies[0].name
+        )
         terminal.say(f"written {arguments.markdown}: {', '.join(names)}")
     return 0
 

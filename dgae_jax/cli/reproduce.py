@@ -14,8 +14,10 @@ import tyro
 
 from dgae_jax.cli import train
 from dgae_jax.cli.arguments import fail, flags_in, parse_known, stopped
-from dgae_jax.configs.algorithms import TABLE
-from dgae_jax.configs.config import Config, ConfigError, invalid, lookup, task_spec
+from dgae_jax.configs.algorithms import ALGORITHMS
+from dgae_jax.configs.config import Config, ConfigError, invalid
+from dgae_jax.configs.resolved import ResolvedConfig
+from dgae_jax.configs.validation import lookup, task_spec
 from dgae_jax.envs.registry import TASKS
 from dgae_jax.run import terminal
 from dgae_jax.run.options import RunOptions, to_dict
@@ -46,7 +48,7 @@ class Arguments:
     """A configuration, of a tuning for example, where they start instead; with one --algos [path]."""
     envs: tuple[str, ...] = tuple(TASKS)
     """Tasks."""
-    algos: tuple[str, ...] = tuple(TABLE)
+    algos: tuple[str, ...] = tuple(ALGORITHMS)
     """Algorithms."""
     variants: str | None = None
     """Instead of the algorithms, all variants of one question: attribution, attribution-noise,
@@ -73,7 +75,9 @@ def main() -> int:
         arguments, rest = parse_known(Arguments, PURPOSE, sys.argv[1:], EXAMPLES, NOTE, REST)
         cells, options = _cells(arguments, rest)
         launch = launcher(arguments.launch)
-        with matrix.opened(arguments.study, cells, shlex.join(["dgae", "reproduce", *sys.argv[1:]])) as study:
+        with matrix.opened(
+            arguments.study, cells, shlex.join(["dgae", "reproduce", *sys.argv[1:]])
+        ) as study:
             from dgae_jax.study.reproduce import reproduce
 
             return reproduce(study, cells, options, launch)
@@ -92,13 +96,17 @@ def _cells(arguments: Arguments, rest: list[str]) -> tuple[list[matrix.Cell], Ru
     for task in arguments.envs:
         task_spec(Config(env=task), "envs")
     for algo in arguments.algos:
-        lookup("algos", algo, TABLE)
+        lookup("algos", algo, ALGORITHMS)
     if not all(0 <= seed < 2**32 for seed in arguments.seeds):
         raise invalid("seeds", arguments.seeds, f"whole numbers from 0 to {2**32 - 1:,}")
     if not 0 < arguments.scale <= 1:
         raise invalid("scale", arguments.scale, "above 0 and at most 1")
     if not 1 <= arguments.seeds_per_run <= len(arguments.seeds):
-        raise invalid("seeds_per_run", arguments.seeds_per_run, f"a whole number from 1 to the number of seeds, {len(arguments.seeds)}")
+        raise invalid(
+            "seeds_per_run",
+            arguments.seeds_per_run,
+            f"a whole number from 1 to the number of seeds, {len(arguments.seeds)}",
+        )
     if arguments.scale != 1 and "--total-steps" in flags_in(rest):
         raise invalid("scale", arguments.scale, "left out with --total-steps")
     if arguments.config and arguments.variants is None and len(arguments.algos) > 1:
@@ -106,23 +114,33 @@ def _cells(arguments: Arguments, rest: list[str]) -> tuple[list[matrix.Cell], Ru
     kinds = _kinds(arguments, rest)
     options = RunOptions()
 
-    def make(task: str, kind: str) -> Config:
+    def make(task: str, kind: str) -> ResolvedConfig:
         nonlocal options
-        start = ["--config", str(arguments.config)] if arguments.config else ["--preset", arguments.preset]
+        start = (
+            ["--config", str(arguments.config)]
+            if arguments.config
+            else ["--preset", arguments.preset]
+        )
         algo, *words = kinds[kind].split()
         config, options = train.parsed([*start, "--env", task, "--algo", algo, *words, *rest])
         _refuse(config, options, task, algo)
         return config if arguments.scale == 1 else _scaled(config, arguments.scale)
 
-    cells = matrix.matrix(arguments.envs, list(kinds), arguments.seeds, arguments.seeds_per_run, make)
+    cells = matrix.matrix(
+        arguments.envs, list(kinds), arguments.seeds, arguments.seeds_per_run, make
+    )
     return cells, dataclasses.replace(options, inexact=arguments.inexact)
 
 
-def _scaled(config: Config, scale: float) -> Config:
+def _scaled(config: ResolvedConfig, scale: float) -> ResolvedConfig:
     steps = int(scale * config.total_steps)
     if steps < config.samples_per_iteration:
         share = f"{config.samples_per_iteration:,} of {config.total_steps:,} samples"
-        raise invalid("scale", scale, f"large enough for one iteration of {config.algo} on {config.env}, {share}")
+        raise invalid(
+            "scale",
+            scale,
+            f"large enough for one iteration of {config.algo} on {config.env}, {share}",
+        )
     return dataclasses.replace(config, total_steps=steps)
 
 
@@ -131,23 +149,31 @@ def _kinds(arguments: Arguments, rest: list[str]) -> dict[str, str]:
     if arguments.variants is None:
         return {algo: algo for algo in arguments.algos}
     if arguments.config:
-        raise invalid("config", arguments.config, "left out with --variants, each of which has an algorithm of its own")
+        raise invalid(
+            "config",
+            arguments.config,
+            "left out with --variants, each of which has an algorithm of its own",
+        )
     if arguments.algos != Arguments.algos:
         raise invalid("algos", arguments.algos, "left out with --variants")
     kinds = lookup("variants", arguments.variants, VARIANTS)
     for name in sorted(flags_in(rest) & flags_in(" ".join(kinds.values()).split())):
-        raise ConfigError(f"{name}: must be left out with --variants {arguments.variants}, whose variants set it")
+        raise ConfigError(
+            f"{name}: must be left out with --variants {arguments.variants}, whose variants set it"
+        )
     return kinds
 
 
-def _refuse(config: Config, options: RunOptions, task: str, algo: str) -> None:
+def _refuse(config: ResolvedConfig, options: RunOptions, task: str, algo: str) -> None:
     """What belongs to one run alone."""
     for name, ours in (("env", task), ("algo", algo)):
         if getattr(config, name) != ours:
             raise invalid(name, getattr(config, name), f"left out: --{name}s says which")
     if config.seed or config.num_seeds != 1:
         name = "seed" if config.seed else "num_seeds"
-        raise invalid(name, getattr(config, name), "left out: --seeds and --seeds-per-run say which")
+        raise invalid(
+            name, getattr(config, name), "left out: --seeds and --seeds-per-run say which"
+        )
     for name, usual in dataclasses.asdict(RunOptions(devices=options.devices)).items():
         value = getattr(options, name)
         if value != usual and name != "cache_dir" and name not in to_dict(options):

@@ -3,13 +3,18 @@
 import os
 from pathlib import Path
 
-from dgae_jax.configs.config import Config, invalid
+from dgae_jax.configs.config import invalid
+from dgae_jax.configs.resolved import ResolvedConfig
 
 
-def check_index(index: int, config: Config, source: Path) -> None:
+def check_index(index: int, config: ResolvedConfig, source: Path) -> None:
     """Raise ConfigError unless so many seeds were trained side by side."""
     if not 0 <= index < config.num_seeds:
-        raise invalid("index", index, f"a whole number from 0 to {config.num_seeds - 1}, the index of a seed in {source}")
+        raise invalid(
+            "index",
+            index,
+            f"a whole number from 0 to {config.num_seeds - 1}, the index of a seed in {source}",
+        )
 
 
 def check_seed(seed: int) -> None:
@@ -21,8 +26,13 @@ def check_seed(seed: int) -> None:
 def check_file(out: Path) -> None:
     """Raise ConfigError unless a file can be written there, as far as can be seen."""
     try:
-        there, is_file = out.absolute().parent.is_dir(), not out.is_symlink() and (out.is_file() or not out.exists())
-    except OSError as reason:  # the name is too long, or lies behind a directory that may not be read
+        there, is_file = (
+            out.absolute().parent.is_dir(),
+            not out.is_symlink() and (out.is_file() or not out.exists()),
+        )
+    except (
+        OSError
+    ) as reason:  # the name is too long, or lies behind a directory that may not be read
         raise invalid("out", out, f"a file that can be written ({reason.strerror})") from reason
     if not there:
         raise invalid("out", out, "a file in a directory that exists")
@@ -37,6 +47,8 @@ def check_directory(out: Path) -> None:
     try:
         above = next(path for path in (out.absolute(), *out.absolute().parents) if path.exists())
     except OSError as reason:  # as above
-        raise invalid("out", out, f"a directory that can be written ({reason.strerror})") from reason
+        raise invalid(
+            "out", out, f"a directory that can be written ({reason.strerror})"
+        ) from reason
     if not (above.is_dir() and os.access(above, os.W_OK)):
         raise invalid("out", out, "a directory that can be written")

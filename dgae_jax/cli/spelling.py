@@ -6,7 +6,7 @@ from dataclasses import fields, is_dataclass
 from itertools import pairwise
 from typing import Any, get_type_hints
 
-from dgae_jax.configs.algorithms import TABLE
+from dgae_jax.configs.algorithms import ALGORITHMS
 from dgae_jax.configs.config import Config, ConfigError, flag
 from dgae_jax.envs.registry import TASKS
 from dgae_jax.run.options import RunOptions
@@ -16,8 +16,8 @@ ELSEWHERE = {
     "num-minibatches": "minibatches", "n-minibatches": "minibatches", "clip-range": "clip", "clip-eps": "clip",
     "clip-coef": "clip", "target-kl": "radius", "max-kl": "radius", "delta": "radius", "cg-damping": "damping", "n-quantiles": "quantiles",
     "num-quantiles": "quantiles", "hidden-sizes": "hidden", "layers": "hidden",
-    "gae-lambda": "lam", "lambda": "lam", "discount": "gamma", "n-steps": "horizon", "num-steps": "horizon", "unroll-length": "horizon",
-    "rollout-length": "horizon", "n-envs": "num-envs", "timesteps": "total-steps", "total-timesteps": "total-steps",
+    "gae-lambda": "lam", "lambda": "lam", "discount": "gamma", "n-steps": "num_steps", "num-steps": "num_steps", "unroll-length": "num_steps",
+    "rollout-length": "num_steps", "n-envs": "num-envs", "timesteps": "total-steps", "total-timesteps": "total-steps",
     "num-timesteps": "total-steps", "env-id": "env", "env-name": "env", "task": "env", "algorithm": "algo", "agent": "algo",
     "engine": "physics", "backend": "physics", "logdir": "run-dir", "log-dir": "run-dir", "output-dir": "run-dir", "out-dir": "run-dir",
 }  # fmt: skip
@@ -29,7 +29,11 @@ def _settings(cls: type, prefix: str = "") -> Iterator[tuple[str, Any]]:
     hints = get_type_hints(cls)
     for f in fields(cls):
         kind, name = hints[f.name], prefix + f.name.replace("_", "-")
-        yield from _settings(kind, name + ".") if is_dataclass(kind) and isinstance(kind, type) else [(name, kind)]
+        yield from (
+            _settings(kind, name + ".")
+            if is_dataclass(kind) and isinstance(kind, type)
+            else [(name, kind)]
+        )
 
 
 FLAGS = dict([*_settings(Config), *_settings(RunOptions)])
@@ -51,7 +55,9 @@ def understood(argv: Sequence[str]) -> list[str]:
     out: list[str] = []
     for before, word in zip(["", *words], words, strict=False):
         out += _value(before[2:].replace("_", "-"), word) if before.startswith("--") else [word]
-    versions = {value for name, value in pairwise(out) if name.replace("_", "-") == flag("env_version")}
+    versions = {
+        value for name, value in pairwise(out) if name.replace("_", "-") == flag("env_version")
+    }
     if len(versions) > 1:
         raise ConfigError(f"--env-version: must be one, not {' and '.join(sorted(versions))}")
     return out
@@ -63,20 +69,26 @@ def refuse_foreign(name: str) -> None:
     spelled = name[2:].replace("_", "-")
     part, dot, last = spelled.rpartition(".")
     ours = ELSEWHERE.get(last, last)
-    meant = [each for each in FLAGS if each in (part + dot + ours, ours) or (not part and each.endswith("." + ours))]
+    meant = [
+        each
+        for each in FLAGS
+        if each in (part + dot + ours, ours) or (not part and each.endswith("." + ours))
+    ]
     if spelled not in FLAGS and meant:
         raise ConfigError(f"{name}: is written {' or '.join('--' + each for each in meant)}")
 
 
 def _value(name: str, value: str) -> list[str]:
     """The value of a flag, and flags that it says more of."""
-    if FLAGS.get(name) in (int, int | None) and re.fullmatch(r"[\d_.]+e\+?\d{1,2}", value, re.IGNORECASE):
+    if FLAGS.get(name) in (int, int | None) and re.fullmatch(
+        r"[\d_.]+e\+?\d{1,2}", value, re.IGNORECASE
+    ):
         try:
             number = float(value)
         except ValueError:
             return [value]
         return [str(int(number))] if number.is_integer() else [value]
-    if name == "algo" and value.lower() in TABLE:
+    if name == "algo" and value.lower() in ALGORITHMS:
         return [value.lower()]
     task, dash, version = value.rpartition("-")
     if name == "env" and dash and task.lower() in TASKS and re.fullmatch(r"v\d+", version):

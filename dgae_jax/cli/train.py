@@ -12,9 +12,9 @@ import tyro
 
 from dgae_jax.cli.arguments import fail, parse, peek, stopped
 from dgae_jax.cli.spelling import understood
-from dgae_jax.configs.config import Config, ConfigError, invalid, resolve
+from dgae_jax.configs.config import Config, ConfigError, invalid
 from dgae_jax.configs.presets import preset
-from dgae_jax.configs.validation import validate
+from dgae_jax.configs.resolved import ResolvedConfig, resolve
 from dgae_jax.run import directory, manifest, terminal
 from dgae_jax.run.options import RunOptions, validate_options
 
@@ -38,7 +38,9 @@ class Arguments:
     """Where all other settings start: tuned (ours) or paper (its set-up)."""
     config: Path | None = None
     """A config.json, of a run for example, where all other settings start instead [path]."""
-    settings: Annotated[Config, tyro.conf.arg(name="")] = field(default_factory=lambda: resolve(Config()))
+    settings: Annotated[Config, tyro.conf.arg(name="")] = field(
+        default_factory=lambda: resolve(Config()).as_config()
+    )
     run: Annotated[RunOptions, tyro.conf.arg(name="")] = field(default_factory=RunOptions)
 
 
@@ -52,7 +54,13 @@ def main() -> int:
         config, options = parsed(sys.argv[1:])
         from dgae_jax.run import loop
 
-        work = loop.resume_or_start if options.resume_or_start else loop.resume if options.resume else loop.train
+        work = (
+            loop.resume_or_start
+            if options.resume_or_start
+            else loop.resume
+            if options.resume
+            else loop.train
+        )
         return work(config, options)
     except ConfigError as mistake:
         fail(mistake)
@@ -60,7 +68,7 @@ def main() -> int:
         return stopped("stopped by SIGINT before training began")
 
 
-def parsed(argv: list[str]) -> tuple[Config, RunOptions]:
+def parsed(argv: list[str]) -> tuple[ResolvedConfig, RunOptions]:
     """The configuration in full and the options that a command line means; raises ConfigError for the first that is invalid."""
     argv = understood(argv)
     given = peek(argv, "preset", "config", "resume", "algo", "env", "policy.update", "critic.kind")
@@ -68,8 +76,10 @@ def parsed(argv: list[str]) -> tuple[Config, RunOptions]:
         raise ConfigError(f"{name}: must be followed by a value", name)
     config = _start(given)
     options = manifest.options(Path(given["resume"])) if given["resume"] else RunOptions()
-    arguments = parse(Arguments, PURPOSE, argv, Arguments(settings=config, run=options), EXAMPLES, NOTE)
-    config = validate(arguments.settings)
+    arguments = parse(
+        Arguments, PURPOSE, argv, Arguments(settings=config, run=options), EXAMPLES, NOTE
+    )
+    config = resolve(arguments.settings)
     validate_options(arguments.run, config)
     return config, arguments.run
 
@@ -82,11 +92,17 @@ def _start(given: dict[str, str | None]) -> Config:
             raise invalid(setting, value, f"left out: all settings start from {other}")
     if not (resume or file):
         update, critic = given["policy.update"], given["critic.kind"]
-        return resolve(preset(name or "tuned", algo or "dppo", given["env"] or Config.env, update, critic))
-    config = directory.read_config(Path(resume)) if resume else directory.read_config_file(Path(str(file)))
+        return resolve(
+            preset(name or "tuned", algo or "dppo", given["env"] or Config.env, update, critic)
+        ).as_config()
+    config = (
+        directory.read_config(Path(resume))
+        if resume
+        else directory.read_config_file(Path(str(file)))
+    )
     if algo not in (None, config.algo):
         raise invalid("algo", algo, f"{config.algo} as in {resume or file}, or left out")
-    return config
+    return config.as_config()
 
 
 if __name__ == "__main__":

@@ -64,9 +64,21 @@ WHOLE = {
 
 LEFT_OUT = {
     "left out: --tuning-seeds says how many, from 1000 on": ("--seed", "--num-seeds"),
-    "left out: the trials are in --study, and go on by themselves": ("--run-dir", "--resume", "--resume-or-start", "--inexact"),
-    "left out: a trial is looked at after each quarter": ("--checkpoint-every", "--keep-checkpoints"),
-    "left out: each worker trains alone, and --storage joins them": ("--coordinator", "--num-processes", "--process-id"),
+    "left out: the trials are in --study, and go on by themselves": (
+        "--run-dir",
+        "--resume",
+        "--resume-or-start",
+        "--inexact",
+    ),
+    "left out: a trial is looked at after each quarter": (
+        "--checkpoint-every",
+        "--keep-checkpoints",
+    ),
+    "left out: each worker trains alone, and --storage joins them": (
+        "--coordinator",
+        "--num-processes",
+        "--process-id",
+    ),
 }
 """Flags of dgae train that a tuning sets itself."""
 
@@ -98,7 +110,11 @@ def _tuning(argv: list[str]) -> Tuning:
     storage = _storage(arguments.storage)
     space = space_of(arguments.search, config)
     if arguments.side_by_side > 1 and (fixed := [path for path in space if not is_traced(path)]):
-        raise invalid("side_by_side", arguments.side_by_side, f"1: another {' or '.join(fixed)} is another program")
+        raise invalid(
+            "side_by_side",
+            arguments.side_by_side,
+            f"1: another {' or '.join(fixed)} is another program",
+        )
     tuning = Tuning(
         config, space, arguments.study or Path("tuning") / f"{config.task}-{config.algo}".replace(":", "-"), options, storage,
         arguments.trials, arguments.tuning_seeds, _workers(arguments), arguments.side_by_side, arguments.sampler_seed,
@@ -115,24 +131,41 @@ def _check(arguments: Arguments, options: RunOptions) -> None:
         raise ConfigError("--search: must name a setting, gamma=0.95:0.999 for one")
     if arguments.side_by_side > 1:
         if options.devices not in (None, 1):
-            raise invalid("devices", options.devices, "left out with --side-by-side, whose program runs on one")
+            raise invalid(
+                "devices",
+                options.devices,
+                "left out with --side-by-side, whose program runs on one",
+            )
         for name in ("log", "debug_nonfinite"):
             if value := getattr(options, name):
-                raise invalid(name, value, "left out with --side-by-side, whose trials have no run directories")
-    if arguments.study is not None and not re.fullmatch(r"[^/\0]{1,200}", arguments.study.absolute().name):
+                raise invalid(
+                    name,
+                    value,
+                    "left out with --side-by-side, whose trials have no run directories",
+                )
+    if arguments.study is not None and not re.fullmatch(
+        r"[^/\0]{1,200}", arguments.study.absolute().name
+    ):
         raise invalid("study", arguments.study, "a directory with a name of its own")
 
 
 def _storage(url: str | None) -> str | None:
     """The address as SQLAlchemy takes it, with the driver that we install."""
-    missing = next((name for name in ("optuna", *(["psycopg"] if url else [])) if find_spec(name) is None), None)
+    missing = next(
+        (name for name in ("optuna", *(["psycopg"] if url else [])) if find_spec(name) is None),
+        None,
+    )
     if missing:
         raise ConfigError(f'{missing}: must be installed for tuning: pip install "dgae_jax[tune]"')
     if url is None:
         return None
     scheme, colon, rest = url.partition("://")
     if not (colon and rest and scheme in ("postgresql", "postgres", "postgresql+psycopg")):
-        raise invalid("storage", f"{scheme}://…" if colon else url, "postgresql://USER:PASSWORD@HOST/NAME, or left out for SQLite")
+        raise invalid(
+            "storage",
+            f"{scheme}://…" if colon else url,
+            "postgresql://USER:PASSWORD@HOST/NAME, or left out for SQLite",
+        )
     return f"postgresql+psycopg://{rest}"
 
 
@@ -144,7 +177,9 @@ def _workers(arguments: Arguments) -> int:
     if wanted is None:
         return 1 if arguments.side_by_side > 1 else min(there, arguments.trials)
     if not 1 <= wanted <= there:
-        raise invalid("workers", wanted, f"a whole number from 1 to {there}, the cores of this machine")
+        raise invalid(
+            "workers", wanted, f"a whole number from 1 to {there}, the cores of this machine"
+        )
     return wanted
 
 

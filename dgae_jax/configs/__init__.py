@@ -1,1 +1,4 @@
-"""What a run is: its configuration, the table of algorithms, presets, what is allowed, and how it is built."""
+"""What a run is: the configuration as a user writes it, the resolved one, presets and their checks.
+
+Nothing here imports JAX, so that a command line is checked before JAX is loaded.
+"""

@@ -1,22 +1,24 @@
-"""The table: an algorithm's name is a row of parts, and nothing else depends on the name."""
+"""The six algorithms: each name is a row of parts, and nothing else depends on the name."""
 
-from typing import NamedTuple
+from typing import Literal, NamedTuple
+
+AlgorithmName = Literal["ppo", "dppo", "trpo", "dtrpo", "a2c", "da2c"]
 
 
 class Row(NamedTuple):
-    """What distinguishes one name from another; each part is a key of a table in `configs.parts`."""
+    """Parts of an algorithm; each is a key of a table in `configs.parts`."""
 
     critic: str
-    """`CRITICS`: one value, or quantiles."""
+    """Key of `CRITICS`: one value, or quantiles."""
     residual: str
-    """`RESIDUALS`: the one thing DGAE changes."""
+    """Key of `RESIDUALS`: the TD error, the one thing that DGAE changes."""
     target: str
-    """`TARGETS`: what the critic is fitted to."""
+    """Key of `TARGETS`: what the critic is fitted to."""
     policy_update: str
-    """`UPDATES`: how the policy improves."""
+    """Key of `UPDATES`: how the policy improves."""
 
 
-TABLE = {
+ALGORITHMS: dict[str, Row] = {
     "ppo": Row("scalar", "td", "lambda-return", "clip"),
     "dppo": Row("quantile", "distributional", "sr-lambda", "clip"),
     "trpo": Row("scalar", "td", "lambda-return", "trust-region"),

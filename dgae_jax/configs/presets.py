@@ -1,88 +1,140 @@
-"""Settings that belong together: `tuned` (ours) and `paper` (its set-up; docs/reproduction.md lists what it leaves open)."""
+"""Settings that belong together: `tuned` (ours) and `paper` (its set-up).
 
-import dataclasses
+Each preset is a list of conditions and the settings that hold where they do; later rows override
+earlier ones. Settings are named by their dotted paths.
+"""
+
 from typing import Any
 
-from dgae_jax.configs.algorithms import TABLE
-from dgae_jax.configs.config import Config, lookup
-from dgae_jax.configs.parts import CRITICS, UPDATES, is_distribution
+from dgae_jax.configs.algorithms import ALGORITHMS
+from dgae_jax.configs.config import Config
+from dgae_jax.configs.parts import CRITICS, UPDATES
+from dgae_jax.configs.validation import lookup
 
-Settings = dict[str, Any]
-"""Fields of `Config`, nested dictionaries for its parts."""
+Overrides = dict[str, Any]
 
 
-def _tuned(update: str, critic: str, env: str) -> list[Settings]:
-    """One setting per way to update; a task departs from it only where it must."""
-    by_update: dict[str, Settings] = {
-        "clip": {"num_envs": 64, "horizon": 32},
+def _tuned(update: str, critic: str, env: str) -> list[Overrides]:
+    """Return one group of settings per update; a task departs from it only where it must."""
+    by_update: dict[str, Overrides] = {
+        "clip": {"num_envs": 64, "num_steps": 32},
         "gradient": {
-            "horizon": 32,
-            "policy": {"optimizer": "rmsprop", "learning_rate": 7e-4, "epochs": 1, "minibatches": 16},
-            "critic": {"learning_rate": 1e-3, "epochs": 5, "minibatches": 16},
+            "num_steps": 32,
+            "policy.optimizer": "rmsprop",
+            "policy.learning_rate": 7e-4,
+            "policy.epochs": 1,
+            "policy.minibatches": 16,
+            "critic.learning_rate": 1e-3,
+            "critic.epochs": 5,
+            "critic.minibatches": 16,
         },
         "trust-region": {
             "gamma": 0.995,  # at 0.99 some seeds of Hopper hop faster and faster, and fall
-            "policy": {"initial_std": 1.0, "radius": 0.03, "learning_rate_end": 0.0, "damping": 0.3, "cg_iterations": 25},
-            "critic": {"learning_rate": 1e-3, "learning_rate_end": 1.0, "epochs": 20, "minibatches": 16},
+            "policy.initial_std": 1.0,
+            "policy.max_kl": 0.03,
+            "policy.learning_rate_end": 0.0,
+            "policy.damping": 0.3,
+            "policy.cg_iterations": 25,
+            "critic.learning_rate": 1e-3,
+            "critic.learning_rate_end": 1.0,
+            "critic.epochs": 20,
+            "critic.minibatches": 16,
         },
     }
-    settings = [by_update.get(update, {})]
-    if env == "hopper":  # with 0.99 a faster hop is worth a later fall, with narrow actions some seeds stand still
-        settings += [{"gamma": 0.995, "policy": {"initial_std": 1.0}}, {"num_envs": 16, "horizon": 128} if update == "clip" else {}]
-    if env == "ant":  # with a longer λ it learns later; with wide actions it falls before it has walked
-        narrow: Settings = {"gamma": 0.99, "policy": {"initial_std": 0.5, "radius": 0.08}}  # a radius for 8 actions, not 3
-        settings += [{"lam": 0.8}, narrow if update == "trust-region" else {}]
-    if env == "swimmer":  # a stroke pays late: short rollouts do not see it, and with less λ or larger steps more seeds make half of it
-        far: Settings = {"num_envs": 2, "horizon": 1024, "lam": 0.99, "policy": {"initial_std": 1.0}}
-        small: Settings = {"policy": {"radius": 0.01}}
-        settings += [{"gamma": 0.9999}, {} if update == "gradient" else far, small if update == "trust-region" else {}]
-    return settings
-
-
-def _paper(update: str, critic: str, env: str) -> list[Settings]:
-    ant = env == "ant"
-    hidden, constant = (512, 512) if ant else (256, 256), {"learning_rate_end": 1.0}
-    quantile = {"quantiles": 64, "target": "bellman"} if is_distribution(critic) else {"target": "lambda-return"}
-    networks: Settings = {
-        "total_steps": 10_000_000 if env in ("ant", "hopper") else 5_000_000,
-        "policy": {"hidden": hidden, "covariance": "state", "initial_std": 1.0},
-        "critic": {"hidden": hidden, **quantile, **constant},
+    # Hopper: with γ = 0.99 a faster hop is worth a later fall; with σ = 0.5 some seeds stand still.
+    # Ant: with a longer λ it learns later; with σ = 1 it falls before it has walked; max_kl is for
+    # 8 action dimensions instead of 3.
+    # Swimmer: a stroke pays late, so short rollouts do not see it.
+    by_env: dict[str, list[Overrides]] = {
+        "hopper": [
+            {"gamma": 0.995, "policy.initial_std": 1.0},
+            {"num_envs": 16, "num_steps": 128} if update == "clip" else {},
+        ],
+        "ant": [
+            {"gae_lambda": 0.8},
+            {"gamma": 0.99, "policy.initial_std": 0.5, "policy.max_kl": 0.08}
+            if update == "trust-region"
+            else {},
+        ],
+        "swimmer": [
+            {"gamma": 0.9999},
+            {"num_envs": 2, "num_steps": 1024, "gae_lambda": 0.99, "policy.initial_std": 1.0}
+            if update != "gradient"
+            else {},
+            {"policy.max_kl": 0.01} if update == "trust-region" else {},
+        ],
     }
-    once = {"optimizer": "rmsprop", "learning_rate": 7e-4, "epochs": 1, "minibatches": 1, **constant}
-    by_update: dict[str, Settings] = {
+    return [by_update.get(update, {}), *by_env.get(env, [])]
+
+
+def _paper(update: str, critic: str, env: str) -> list[Overrides]:
+    """Return the paper's set-up (Sec. results); docs/reproducing.md lists what it leaves open."""
+    ant = env == "ant"
+    hidden = (512, 512) if ant else (256, 256)
+    distribution = "quantiles" in CRITICS[critic]
+    for_all: Overrides = {
+        "total_steps": 10_000_000 if env in ("ant", "hopper") else 5_000_000,
+        "policy.hidden": hidden,
+        "policy.covariance": "state",
+        "policy.initial_std": 1.0,
+        "critic.hidden": hidden,
+        "critic.learning_rate_end": 1.0,
+        "critic.target": "bellman" if distribution else "lambda-return",
+        **({"critic.quantiles": 64} if distribution else {}),
+    }
+    once = {
+        "optimizer": "rmsprop",
+        "learning_rate": 7e-4,
+        "learning_rate_end": 1.0,
+        "epochs": 1,
+        "minibatches": 1,
+    }
+    by_update: dict[str, Overrides] = {
         "clip": {
-            "horizon": 256 if ant else 128,
-            "policy": {"minibatches": 64 if ant else 32, **constant},
-            "critic": {"minibatches": 64 if ant else 32},
+            "num_steps": 256 if ant else 128,
+            "policy.minibatches": 64 if ant else 32,
+            "policy.learning_rate_end": 1.0,
+            "critic.minibatches": 64 if ant else 32,
         },
         "trust-region": {
             "num_envs": 50 if ant else 25,
-            "horizon": 1000,
-            "critic": {"learning_rate": 1e-3, "minibatches": 500 if ant else 250},
+            "num_steps": 1000,
+            "critic.learning_rate": 1e-3,
+            "critic.minibatches": 500 if ant else 250,
         },
-        "gradient": {"horizon": 5, "policy": once, "critic": once},
+        "gradient": {
+            "num_steps": 5,
+            **{f"policy.{name}": value for name, value in once.items()},
+            **{f"critic.{name}": value for name, value in once.items()},
+        },
     }
-    return [networks, by_update.get(update, {})]
+    return [for_all, by_update.get(update, {})]
 
 
 PRESETS = {"tuned": _tuned, "paper": _paper}
 
 
-def preset(name: str, algo: str, env: str, update: str | None = None, critic: str | None = None) -> Config:
-    """The configuration of a preset for an algorithm on a task; `update` and `critic` take the place of the algorithm's own.
+def preset(
+    name: str, algo: str, env: str, update: str | None = None, critic: str | None = None
+) -> Config:
+    """Return the configuration of a preset for an algorithm on a task.
 
-    Raises ConfigError for a name that does not exist.
+    Args:
+        name: `tuned` or `paper`.
+        algo: name of the algorithm.
+        env: name of the task.
+        update: policy update in place of the algorithm's own.
+        critic: kind of critic in place of the algorithm's own.
+
+    Raises:
+        ConfigError: a name does not exist.
     """
-    settings, row = lookup("preset", name, PRESETS), lookup("algo", algo, TABLE)
-    lookup("policy.update", update or row.policy_update, UPDATES)
-    lookup("critic.kind", critic or row.critic, CRITICS)
-    config = Config(env=env, algo=algo)
-    config = _with(config, {"policy": {"update": update}, "critic": {"kind": critic}})
-    for group in settings(update or row.policy_update, critic or row.critic, env):
-        config = _with(config, group)
+    config = Config(env=env, algo=algo)  # pyright: ignore[reportArgumentType]
+    groups, row = lookup("preset", name, PRESETS), lookup("algo", config.algo, ALGORITHMS)
+    config = config.replace(**{"policy.update": update, "critic.kind": critic})
+    update, critic = update or row.policy_update, critic or row.critic
+    lookup("policy.update", update, UPDATES)
+    lookup("critic.kind", critic, CRITICS)
+    for overrides in groups(update, critic, config.env):
+        config = config.replace(**overrides)
     return config
-
-
-def _with(config: Any, settings: Settings) -> Any:
-    parts = {k: _with(getattr(config, k), v) if isinstance(v, dict) else v for k, v in settings.items()}
-    return dataclasses.replace(config, **parts)

@@ -1,86 +1,141 @@
-"""What a configuration may be: every setting alone, and all of them together. Nothing here imports JAX.
+"""Checks of a configuration: types, every setting alone, and all of them together.
 
-Values that are traced are not known yet and pass unchecked.
+Values that are traced by JAX are not known yet and pass unchecked.
 """
 
 import dataclasses
 import math
-from typing import Any
+from collections.abc import Mapping
+from typing import Any, Literal, get_args, get_origin, get_type_hints
 
-from dgae_jax.configs.config import Config, ConfigError, invalid, lookup, resolve, task_spec
-from dgae_jax.configs.parts import COVARIANCES, CRITICS, OPTIMIZERS, RESIDUALS, TARGETS, UPDATES, is_distribution
-from dgae_jax.configs.serial import check_types
+from dgae_jax.configs import parts
+from dgae_jax.configs.config import Config, ConfigError, Settings, invalid
+from dgae_jax.envs.registry import EnvSpec, spec_of
 from dgae_jax.maths.risk import check_metric
 from dgae_jax.physics.registry import ENGINES, require
 
-LARGEST = 2**31 - 1
-"""What an int32, the largest index and counter of a device, can hold."""
+INT32_MAX = 2**31 - 1
+"""The largest index and counter of a device."""
 
 WHOLE = {
     "num_seeds": (1, 4096, "every one is a whole run in the same program"),
-    "total_steps": (1, LARGEST, "samples are counted in an int32"),
-    "num_envs": (1, LARGEST, "samples are indexed by an int32"),
-    "horizon": (1, LARGEST, "samples are indexed by an int32"),
-    "episode_length": (1, LARGEST, "steps are counted in an int32"),
-    "policy.epochs": (1, 10_000, "a pass more often over one rollout only fits its noise"),
-    "policy.minibatches": (1, LARGEST, "samples are indexed by an int32"),
-    "policy.cg_iterations": (1, 1000, "conjugate gradient has lost its orthogonality in float32 long before"),
-    "policy.backtracks": (0, 100, "a step halved more often is 0 in float32"),
-    "policy.fisher_every": (1, LARGEST, "samples are indexed by an int32"),
-    "critic.epochs": (1, 10_000, "a pass more often over one rollout only fits its noise"),
-    "critic.minibatches": (1, LARGEST, "samples are indexed by an int32"),
+    "total_steps": (1, INT32_MAX, "samples are counted in an int32"),
+    "num_envs": (1, INT32_MAX, "samples are indexed by an int32"),
+    "num_steps": (1, INT32_MAX, "samples are indexed by an int32"),
+    "episode_length": (1, INT32_MAX, "steps are counted in an int32"),
+    "policy.epochs": (1, 10_000, "more passes over one rollout only fit its noise"),
+    "policy.minibatches": (1, INT32_MAX, "samples are indexed by an int32"),
+    "policy.cg_iterations": (1, 1000, "conjugate gradient loses orthogonality in float32 before"),
+    "policy.max_backtracks": (0, 100, "a step halved more often is 0 in float32"),
+    "policy.fisher_every": (1, INT32_MAX, "samples are indexed by an int32"),
+    "critic.epochs": (1, 10_000, "more passes over one rollout only fit its noise"),
+    "critic.minibatches": (1, INT32_MAX, "samples are indexed by an int32"),
     "critic.quantiles": (1, 10_000, "their residuals are K × K for every sample"),
 }
-"""Whole numbers: from, to, and why not more."""
+"""Whole numbers: lowest, highest, and the reason for the highest."""
 
-LAYERS, WIDTH = 32, 65_536
-"""Most hidden layers and units in one: XLA compiles each layer by itself, and a layer this wide fills a large device."""
+MAX_LAYERS, MAX_WIDTH = 32, 65_536
+"""XLA compiles each layer by itself; one layer of this width has 17 GB of weights."""
 
-UNIT = ("gamma", "lam", "policy.learning_rate_end", "critic.learning_rate_end")
+UNIT = ("gamma", "gae_lambda", "policy.learning_rate_end", "critic.learning_rate_end")
 """Numbers from 0 to 1."""
 
 POSITIVE = (
-    "policy.clip", "policy.initial_std", "policy.radius", "policy.damping", "policy.learning_rate", "policy.max_grad_norm",
-    "critic.learning_rate", "critic.max_grad_norm", "critic.kappa",
-)  # fmt: skip
+    "policy.clip_eps",
+    "policy.initial_std",
+    "policy.max_kl",
+    "policy.damping",
+    "policy.learning_rate",
+    "policy.max_grad_norm",
+    "critic.learning_rate",
+    "critic.max_grad_norm",
+    "critic.kappa",
+)
 """Numbers above 0."""
 
 CHOICES = {
-    "policy.covariance": COVARIANCES, "policy.optimizer": OPTIMIZERS, "critic.optimizer": OPTIMIZERS, "critic.target": TARGETS,
-    "residual": RESIDUALS,
-}  # fmt: skip
+    "policy.covariance": parts.COVARIANCES,
+    "policy.optimizer": parts.OPTIMIZERS,
+    "critic.optimizer": parts.OPTIMIZERS,
+    "critic.target": parts.TARGETS,
+    "residual": parts.RESIDUALS,
+}
+"""Names, and the table that each must be in."""
 
 
-def validate(config: Config) -> Config:
-    """The configuration resolved, with everything unset that the run uses written out.
-
-    Raises ConfigError for the first setting that is invalid, alone or together with the others.
-    """
-    check_types(config)
-    full = resolve(config)
-    _check_task(full)
-    _check_each(full)
-    _check_networks(full)
-    _check_use(full)
-    _check_samples(full)
-    return full
+def lookup(setting: str, name: Any, table: Mapping[str, Any]) -> Any:
+    """Return the entry of a table; raise ConfigError, listing the names, for an unknown one."""
+    if not isinstance(name, str) or name not in table:
+        raise invalid(setting, name, f"one of {', '.join(table)}")
+    return table[name]
 
 
-def _check(setting: str, value: Any, ok: bool, allowed: str) -> None:
+def task_spec(config: Config, setting: str = "env") -> EnvSpec:
+    """Return the spec of the configuration's task; raise ConfigError for an unknown one."""
+    try:
+        return spec_of(config.env)
+    except ValueError as allowed:
+        raise invalid(setting, config.env, str(allowed)) from None
+
+
+def check_types(settings: Settings, prefix: str = "") -> None:
+    """Raise ConfigError for a setting of the wrong type; arrays pass for numbers."""
+    for name, kind in get_type_hints(type(settings)).items():
+        value, path = getattr(settings, name), prefix + name
+        if dataclasses.is_dataclass(kind):
+            if not isinstance(value, kind):  # pyright: ignore[reportArgumentType]
+                raise ConfigError(f"{path} {value!r}: must be {kind.__name__}", path)
+            check_types(value, f"{path}.")
+        elif value is not None or type(None) not in get_args(kind):
+            if not (hasattr(value, "dtype") or _has_type(value, _plain(kind))):
+                kind = _plain(kind)
+                shown = getattr(get_origin(kind) or kind, "__name__", kind)
+                raise ConfigError(f"{path}: must be {shown}, not {value!r}", path)
+
+
+def _plain(kind: Any) -> Any:
+    """Return the type behind `| None`, and str for a choice of names, which may be registered."""
+    if type(None) in get_args(kind):
+        kind = get_args(kind)[0]
+    return str if get_origin(kind) is Literal else kind
+
+
+def _has_type(value: Any, kind: Any) -> bool:
+    if get_origin(kind) is tuple:
+        return isinstance(value, tuple) and all(type(each) is int for each in value)
+    return type(value) is kind
+
+
+def check_unused(
+    who: str, group: str, settings: Settings, used: Mapping[str, Any], table: Mapping[str, Any]
+) -> None:
+    """Raise ConfigError for a setting that only other parts of `table` would use."""
+    for name in sorted({option for each in table.values() for option in each} - set(used)):
+        if (value := getattr(settings, name)) is not None:
+            raise invalid(f"{group}.{name}", value, f"unset: it has no effect with {who}")
+
+
+def check(config: Config, spec: EnvSpec) -> None:
+    """Raise ConfigError for the first invalid setting of a configuration that is filled in."""
+    _check_task(config, spec)
+    _check_each(config)
+    _check_networks(config)
+    _check_metric(config)
+    _check_samples(config)
+
+
+def _require(setting: str, value: Any, ok: bool, allowed: str) -> None:
     if not ok:
         raise invalid(setting, value, allowed)
 
 
-def _get(config: Config, path: str) -> Any:
-    """The value of a setting; None where it is unset or traced."""
-    value: Any = config
-    for name in path.split("."):
-        value = getattr(value, name)
+def _known(config: Config, path: str) -> Any:
+    """Return the value of a setting; None where it is unset or traced."""
+    value = config.get(path)
     return value if isinstance(value, int | float | str | tuple) else None
 
 
-def _check_task(config: Config) -> None:
-    spec = task_spec(config)
+def _check_task(config: Config, spec: EnvSpec) -> None:
     lookup("physics", config.physics, dict.fromkeys(spec.engines))
     try:
         if config.physics in ENGINES:
@@ -90,68 +145,69 @@ def _check_task(config: Config) -> None:
     if spec.versions:
         lookup("env_version", config.env_version, dict.fromkeys(spec.versions))
     else:
-        _check("env_version", config.env_version, config.env_version is None, f"left out with {config.env}")
-        _check("noise.initial", config.noise.initial, config.noise.initial == 0, f"left out with {config.env}")
+        only = f"unset with {config.env}"
+        _require("env_version", config.env_version, config.env_version is None, only)
+        _require("noise.initial", config.noise.initial, config.noise.initial == 0, only)
     for name, std in dataclasses.asdict(config.noise).items():
-        _check(f"noise.{name}", std, std >= 0 and math.isfinite(std), "a finite number of at least 0")
+        ok = std >= 0 and math.isfinite(std)
+        _require(f"noise.{name}", std, ok, "a finite number of at least 0")
 
 
 def _check_each(config: Config) -> None:
     for path, (low, high, reason) in WHOLE.items():
-        if (value := _get(config, path)) is not None:
-            _check(path, value, low <= value <= high, f"a whole number from {low:,} to {high:,} ({reason})")
+        if (value := _known(config, path)) is not None:
+            allowed = f"a whole number from {low:,} to {high:,} ({reason})"
+            _require(path, value, low <= value <= high, allowed)
     for path in UNIT:
-        if (value := _get(config, path)) is not None:
-            _check(path, value, 0 <= value <= 1, "a number from 0 to 1")
+        if (value := _known(config, path)) is not None:
+            _require(path, value, 0 <= value <= 1, "a number from 0 to 1")
     for path in POSITIVE:
-        if (value := _get(config, path)) is not None:
-            _check(path, value, 1e-30 <= value <= 1e30, "a number above 0, from 1e-30 to 1e30")
+        if (value := _known(config, path)) is not None:
+            _require(path, value, 1e-30 <= value <= 1e30, "a number above 0, from 1e-30 to 1e30")
     for path, table in CHOICES.items():
-        if (value := _get(config, path)) is not None:
+        if (value := _known(config, path)) is not None:
             lookup(path, value, table)
     highest = 2**32 - config.num_seeds
-    _check("seed", config.seed, 0 <= config.seed <= highest, f"a whole number from 0 to {highest:,} (seeds are numbers of 32 bits)")
+    allowed = f"a whole number from 0 to {highest:,} (seeds are numbers of 32 bits)"
+    _require("seed", config.seed, 0 <= config.seed <= highest, allowed)
 
 
 def _check_networks(config: Config) -> None:
     for path in ("policy.hidden", "critic.hidden"):
-        hidden = _get(config, path)
-        _check(path, hidden, len(hidden) >= 1 and min(hidden) >= 1, "one or more widths of at least 1")
-        _check(path, hidden, max(hidden) <= WIDTH, f"widths of at most {WIDTH:,} (one layer of them has 17 GB of weights)")
-        if len(hidden) > LAYERS:
-            raise ConfigError(
-                f"{path} of {len(hidden):,} layers: must be at most {LAYERS} (XLA compiles a thousand for half an hour)", path
-            )
+        hidden = config.get(path)
+        ok = len(hidden) >= 1 and min(hidden) >= 1
+        _require(path, hidden, ok, "one or more widths of at least 1")
+        allowed = f"widths of at most {MAX_WIDTH:,} (one layer of them has 17 GB of weights)"
+        _require(path, hidden, max(hidden) <= MAX_WIDTH, allowed)
+        if len(hidden) > MAX_LAYERS:
+            allowed = f"at most {MAX_LAYERS} (XLA compiles a thousand for half an hour)"
+            raise ConfigError(f"{path} of {len(hidden):,} layers: must be {allowed}", path)
 
 
-def _check_use(config: Config) -> None:
-    """No setting that the parts of this run do not use."""
-    for part, group, chosen, table in (
-        ("policy", config.policy, config.policy.update, UPDATES),
-        ("critic", config.critic, config.critic.kind, CRITICS),
-    ):
-        unused = {option for each in table.values() for option in each.options} - set(lookup(part, chosen, table).options)
-        for name in sorted(unused):
-            value = getattr(group, name)
-            _check(f"{part}.{name}", value, value is None, f"left out: {config.algo} with {chosen} does not use it")
+def _check_metric(config: Config) -> None:
     try:
         check_metric(config.metric)
     except ValueError as allowed:
         raise invalid("metric", config.metric, str(allowed)) from None
-    distribution = is_distribution(str(config.critic.kind))
-    _check("diagnostics", config.diagnostics, distribution or not config.diagnostics, f"left out: the critic of {config.algo} is scalar")
+    distribution = "quantiles" in parts.CRITICS[str(config.critic.kind)]
     used = config.metric == "mean" or (config.residual == "distributional" and distribution)
-    _check("metric", config.metric, used, f"mean with {config.algo}: other metrics need a distributional residual and a quantile critic")
+    allowed = f"mean with {config.algo}: other metrics need a distributional residual and quantiles"
+    _require("metric", config.metric, used, allowed)
+    ok = distribution or not config.diagnostics
+    _require("diagnostics", config.diagnostics, ok, f"off: the critic of {config.algo} is scalar")
 
 
 def _check_samples(config: Config) -> None:
     samples = config.samples_per_iteration
-    _check("num_envs", config.num_envs, samples <= LARGEST, f"such that num_envs * horizon is at most {LARGEST:,}")
+    allowed = f"such that num_envs * num_steps is at most {INT32_MAX:,}"
+    _require("num_envs", config.num_envs, samples <= INT32_MAX, allowed)
     for path in ("policy.minibatches", "critic.minibatches"):
-        if (minibatches := _get(config, path)) is not None:
-            _check(path, minibatches, samples % minibatches == 0, f"a divisor of num_envs * horizon = {samples:,}")
-    if (every := _get(config, "policy.fisher_every")) is not None:
-        _check("policy.fisher_every", every, every <= samples, f"at most num_envs * horizon = {samples:,}")
-    if _get(config, "total_steps") is not None:
-        enough = config.total_steps >= samples
-        _check("total_steps", config.total_steps, enough, f"at least one iteration of num_envs * horizon = {samples:,} samples")
+        if (value := _known(config, path)) is not None:
+            allowed = f"a divisor of num_envs * num_steps = {samples:,}"
+            _require(path, value, samples % value == 0, allowed)
+    if (every := _known(config, "policy.fisher_every")) is not None:
+        allowed = f"at most num_envs * num_steps = {samples:,}"
+        _require("policy.fisher_every", every, every <= samples, allowed)
+    if (total := _known(config, "total_steps")) is not None:
+        allowed = f"at least one iteration of num_envs * num_steps = {samples:,} samples"
+        _require("total_steps", total, total >= samples, allowed)

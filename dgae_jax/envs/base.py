@@ -17,7 +17,9 @@ def restart(env: Env, state: State, rng: Array, done: Array) -> State:
     It is `env.reset(rng)`, computed in every world at every step, unless the class of `env` has a method
     `restart(state, rng, done)` of its own, which may return anything of that shape for a world that is not done.
     """
-    own = getattr(type(env), "restart", None)  # a wrapper passes on what its environment has, which is not its own
+    own = getattr(
+        type(env), "restart", None
+    )  # a wrapper passes on what its environment has, which is not its own
     return env.reset(rng) if own is None else own(env, state, rng, done)
 
 

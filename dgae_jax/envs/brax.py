@@ -34,10 +34,14 @@ def make(name: str, physics: str, version: None, **parameters) -> Env:
     """The environment that Brax calls `name`, on Brax's MJX backend; raises ValueError where Brax cannot build it."""
     try:
         with warnings.catch_warnings(), silenced():
-            warnings.simplefilter("ignore")  # Brax speaks of features of its model files that it leaves out
+            warnings.simplefilter(
+                "ignore"
+            )  # Brax speaks of features of its model files that it leaves out
             return BraxTask(brax.envs.get_environment(name, backend=physics, **parameters))
     except (ValueError, TypeError) as reason:
-        raise ValueError(f"environment {BRAX}{name}: must be one that Brax can build on {physics} ({reason})") from None
+        raise ValueError(
+            f"environment {BRAX}{name}: must be one that Brax can build on {physics} ({reason})"
+        ) from None
 
 
 @contextmanager

@@ -18,11 +18,15 @@ def check(env: Env) -> None:
     after = _traced("step", env.step, before, action)
     for state, where in ((before, "reset"), (after, "step")):
         if getattr(state.obs, "shape", None) != (_size(env, "observation_size"),):
-            raise ValueError(f"the observation of its {where} has shape {_shapes(state.obs)}, and must be one array [observation_size]")
+            raise ValueError(
+                f"the observation of its {where} has shape {_shapes(state.obs)}, and must be one array [observation_size]"
+            )
         for name in ("reward", "done"):
             value = getattr(state, name)
             if getattr(value, "shape", None) != () or not jnp.issubdtype(value.dtype, jnp.floating):
-                raise ValueError(f"the {name} of its {where} is {value}, and must be a single real number")
+                raise ValueError(
+                    f"the {name} of its {where} is {value}, and must be a single real number"
+                )
     _same(before, after)
 
 
@@ -38,15 +42,21 @@ def _traced(name: str, function: Any, *arguments: Any) -> Any:
         return jax.eval_shape(function, *arguments)
     except Exception as reason:  # the code is somebody else's
         why = str(reason).partition("\n")[0]
-        raise ValueError(f"its {name} cannot be compiled by JAX ({type(reason).__name__}: {why})") from reason
+        raise ValueError(
+            f"its {name} cannot be compiled by JAX ({type(reason).__name__}: {why})"
+        ) from reason
 
 
 def _same(before: Any, after: Any) -> None:
-    leaves, others = (dict(jax.tree_util.tree_flatten_with_path(state)[0]) for state in (before, after))
+    leaves, others = (
+        dict(jax.tree_util.tree_flatten_with_path(state)[0]) for state in (before, after)
+    )
     for path in leaves | others:
         one, two = (_shapes(each.get(path)) for each in (leaves, others))
         if one != two:
-            raise ValueError(f"its step turns state{jax.tree_util.keystr(path)} from {one} into {two}, and must leave it as it is")
+            raise ValueError(
+                f"its step turns state{jax.tree_util.keystr(path)} from {one} into {two}, and must leave it as it is"
+            )
 
 
 def _shapes(tree: Any) -> str:

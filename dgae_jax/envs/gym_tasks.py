@@ -37,12 +37,20 @@ class Walker2d(HealthyTask):
         reset_noise_scale: float = 5e-3,
         **parameters,
     ):
-        super().__init__(physics, version, ctrl_cost_weight=ctrl_cost_weight, reset_noise_scale=reset_noise_scale, **parameters)
+        super().__init__(
+            physics,
+            version,
+            ctrl_cost_weight=ctrl_cost_weight,
+            reset_noise_scale=reset_noise_scale,
+            **parameters,
+        )
         self._healthy_z_range = healthy_z_range
         self._healthy_angle_range = healthy_angle_range
 
     def _is_healthy(self, physics: PhysicsState) -> Bool[Array, ""]:
-        return _inside(physics.qpos[1], self._healthy_z_range) & _inside(physics.qpos[2], self._healthy_angle_range)
+        return _inside(physics.qpos[1], self._healthy_z_range) & _inside(
+            physics.qpos[2], self._healthy_angle_range
+        )
 
 
 class Hopper(Walker2d):
@@ -60,7 +68,13 @@ class Hopper(Walker2d):
         healthy_angle_range: Range = (-0.2, 0.2),
         **parameters,
     ):
-        super().__init__(physics, version, healthy_z_range=healthy_z_range, healthy_angle_range=healthy_angle_range, **parameters)
+        super().__init__(
+            physics,
+            version,
+            healthy_z_range=healthy_z_range,
+            healthy_angle_range=healthy_angle_range,
+            **parameters,
+        )
         self._healthy_state_range = healthy_state_range
 
     def _is_healthy(self, physics: PhysicsState) -> Bool[Array, ""]:
@@ -75,8 +89,22 @@ class Swimmer(Task):
     AXES = 2
     TERMS = ("reward_forward", "reward_ctrl")
 
-    def __init__(self, physics: Physics, version: str, *, ctrl_cost_weight: float = 1e-4, reset_noise_scale: float = 0.1, **parameters):
-        super().__init__(physics, version, ctrl_cost_weight=ctrl_cost_weight, reset_noise_scale=reset_noise_scale, **parameters)
+    def __init__(
+        self,
+        physics: Physics,
+        version: str,
+        *,
+        ctrl_cost_weight: float = 1e-4,
+        reset_noise_scale: float = 0.1,
+        **parameters,
+    ):
+        super().__init__(
+            physics,
+            version,
+            ctrl_cost_weight=ctrl_cost_weight,
+            reset_noise_scale=reset_noise_scale,
+            **parameters,
+        )
 
 
 class Ant(HealthyTask):
@@ -103,7 +131,13 @@ class Ant(HealthyTask):
         include_cfrc_ext_in_observation: bool = True,
         **parameters,
     ):
-        super().__init__(physics, version, ctrl_cost_weight=ctrl_cost_weight, reset_noise_scale=reset_noise_scale, **parameters)
+        super().__init__(
+            physics,
+            version,
+            ctrl_cost_weight=ctrl_cost_weight,
+            reset_noise_scale=reset_noise_scale,
+            **parameters,
+        )
         self._contact_cost_weight = contact_cost_weight
         self._healthy_z_range = healthy_z_range
         self._contact_force_range = contact_force_range
@@ -135,4 +169,6 @@ class Ant(HealthyTask):
         return {**super()._terms(before, after, action, velocity), "reward_contact": -cost}
 
     def _observation(self, physics: PhysicsState) -> Float[Array, " O"]:
-        return jnp.concatenate([super()._observation(physics), self._forces(physics)[self._observed_bodies].ravel()])
+        return jnp.concatenate(
+            [super()._observation(physics), self._forces(physics)[self._observed_bodies].ravel()]
+        )

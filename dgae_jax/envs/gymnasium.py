@@ -56,9 +56,15 @@ def make_world(name: str, **parameters) -> gymnasium.Env:
         why = str(reason).partition("\n")[0]
         raise ValueError(f"Gymnasium cannot make it: {type(reason).__name__}: {why}") from reason
     for what, space in (("actions", world.action_space), ("observations", world.observation_space)):
-        if not (isinstance(space, Box) and len(space.shape) == 1 and (what == "observations" or space.dtype.kind == "f")):
+        if not (
+            isinstance(space, Box)
+            and len(space.shape) == 1
+            and (what == "observations" or space.dtype.kind == "f")
+        ):
             world.close()
-            raise ValueError(f"its {what} are {space}, and must be a Box with one axis of real numbers")
+            raise ValueError(
+                f"its {what} are {space}, and must be a Box with one axis of real numbers"
+            )
     return InRange(world)
 
 
@@ -86,7 +92,9 @@ class _Worlds:
             if at[1] == 0 and (i >= len(self.worlds) or self.at[i] != at):
                 self._begin(i, at[0])
             if self.at[i] != at:
-                raise RuntimeError("a world of Gymnasium only goes forward, and was asked to go on from where it is not any more")
+                raise RuntimeError(
+                    "a world of Gymnasium only goes forward, and was asked to go on from where it is not any more"
+                )
             obs[i], reward[i], terminated[i], truncated[i], _ = self.worlds[i].step(actions[i])
             self.at[i] = (at[0], at[1] + 1)
 
@@ -116,8 +124,12 @@ class GymnasiumTask(Env):
         self._actions: Any = first.action_space
         self._observation_size = first.observation_space.shape[0]  # pyright: ignore[reportOptionalSubscript]
         self._worlds = _Worlds(lambda: make_world(name, **parameters), first)
-        number = next(_count)  # by the order in which a process makes its tasks, so that a kept program finds them again
-        self._reset, self._step = (f"dgae_jax_gymnasium_{number}_{call}" for call in ("reset", "step"))
+        number = next(
+            _count
+        )  # by the order in which a process makes its tasks, so that a kept program finds them again
+        self._reset, self._step = (
+            f"dgae_jax_gymnasium_{number}_{call}" for call in ("reset", "step")
+        )
         ffi.register(self._reset, _weak(self._worlds, _Worlds.reset))
         ffi.register(self._step, _weak(self._worlds, _Worlds.step))
 
@@ -153,21 +165,34 @@ class GymnasiumTask(Env):
         """One step of the world, which must be where `state` is."""
         at: Any = state.pipeline_state
         number = jnp.zeros((), state.obs.dtype)
-        like = tuple(jax.ShapeDtypeStruct(x.shape, x.dtype) for x in (state.obs, number, number, number))
+        like = tuple(
+            jax.ShapeDtypeStruct(x.shape, x.dtype) for x in (state.obs, number, number, number)
+        )
         obs, reward, terminated, truncated = _call(self._step, like, at.seed, at.steps, action)
         cut = truncated * (1 - terminated)
         return state.replace(
-            pipeline_state=at._replace(steps=at.steps + 1), obs=obs, reward=reward, done=terminated + cut, info={"truncation": cut}
+            pipeline_state=at._replace(steps=at.steps + 1),
+            obs=obs,
+            reward=reward,
+            done=terminated + cut,
+            info={"truncation": cut},
         )
 
     def _begin(self, rng: Array, needed: Bool[Array, ""]) -> State:
         seed, zero = jax.random.bits(rng, (2,), jnp.uint32), jnp.zeros(())
-        (obs,) = _call(self._reset, (jax.ShapeDtypeStruct((self._observation_size,), zero.dtype),), seed, needed)
+        (obs,) = _call(
+            self._reset,
+            (jax.ShapeDtypeStruct((self._observation_size,), zero.dtype),),
+            seed,
+            needed,
+        )
         return State(Whereabouts(seed, jnp.int32(0)), obs, zero, zero, info={"truncation": zero})  # pyright: ignore[reportArgumentType]
 
 
 def _call(name: str, like: tuple[jax.ShapeDtypeStruct, ...], *arguments: Array) -> Any:
-    return jax.ffi.ffi_call(name, like, vmap_method="broadcast_all", has_side_effect=True)(*arguments)
+    return jax.ffi.ffi_call(name, like, vmap_method="broadcast_all", has_side_effect=True)(
+        *arguments
+    )
 
 
 def _weak(worlds: _Worlds, method: Callable) -> ffi.Function:

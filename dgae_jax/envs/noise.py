@@ -17,11 +17,24 @@ class Noisy(Wrapper):
     velocities at a reset, for our own tasks.
     """
 
-    def __init__(self, env: Env, *, reward: float = 0.0, action: float = 0.0, observation: float = 0.0, initial: float = 0.0):
+    def __init__(
+        self,
+        env: Env,
+        *,
+        reward: float = 0.0,
+        action: float = 0.0,
+        observation: float = 0.0,
+        initial: float = 0.0,
+    ):
         super().__init__(env)
         if initial and not isinstance(env, Task):
             raise ValueError("noise on the initial state is for our own tasks")
-        self._reward, self._action, self._observation, self._initial = reward, action, observation, initial
+        self._reward, self._action, self._observation, self._initial = (
+            reward,
+            action,
+            observation,
+            initial,
+        )
 
     @property
     def action_range(self) -> tuple[Array, Array]:
@@ -41,7 +54,10 @@ class Noisy(Wrapper):
         state = reset(r_key)
         if self._initial:
             physics: Any = state.pipeline_state
-            moved = (x + self._initial * jax.random.normal(k, x.shape) for k, x in ((q_key, physics.qpos), (v_key, physics.qvel)))
+            moved = (
+                x + self._initial * jax.random.normal(k, x.shape)
+                for k, x in ((q_key, physics.qpos), (v_key, physics.qvel))
+            )
             state = self.env.set_state(state, *moved)
         return self._seen(state, o_key, key)
 

@@ -27,9 +27,13 @@ class PlaygroundTask(Env):
     def __init__(self, env: Any, physics: str, episode_length: int, action_repeat: int):
         self._env, self._physics = EpisodeWrapper(env, episode_length, action_repeat), physics
         self._action_size = env.action_size
-        shape = getattr(_policy_sees(jax.eval_shape(env.reset, jax.random.key(0)).obs), "shape", None)
+        shape = getattr(
+            _policy_sees(jax.eval_shape(env.reset, jax.random.key(0)).obs), "shape", None
+        )
         if shape is None or len(shape) != 1:
-            raise ValueError("its observations must be one array with one axis, or have one of that kind that is named state")
+            raise ValueError(
+                "its observations must be one array with one axis, or have one of that kind that is named state"
+            )
         self._observation_size = shape[0]
 
     @property
@@ -66,7 +70,13 @@ def _policy_sees(obs: Any) -> Any:
 
 
 def _state(inner: Any) -> State:
-    return State(inner, _policy_sees(inner.obs), inner.reward, inner.done, info={"truncation": inner.info["truncation"]})
+    return State(
+        inner,
+        _policy_sees(inner.obs),
+        inner.reward,
+        inner.done,
+        info={"truncation": inner.info["truncation"]},
+    )
 
 
 def make(name: str, physics: str, version: None, **parameters) -> Env:
@@ -84,7 +94,9 @@ def make(name: str, physics: str, version: None, **parameters) -> Env:
             near = get_close_matches(name, registry.ALL_ENVS, 3) or dm_control_suite.ALL_ENVS
             raise ValueError(f"Playground has no {name}, but {', '.join(near)}")
         if name not in dm_control_suite.ALL_ENVS and not MENAGERIE_PATH.exists():
-            raise ValueError(f"its robot is in mujoco_menagerie, which Playground looks for in {MENAGERIE_PATH} and would download")
+            raise ValueError(
+                f"its robot is in mujoco_menagerie, which Playground looks for in {MENAGERIE_PATH} and would download"
+            )
         config: Any = registry.get_default_config(name).lock()  # with a new name it is a mistake
         try:
             config.update_from_flattened_dict({"impl": IMPL[physics], **parameters})

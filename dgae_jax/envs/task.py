@@ -23,7 +23,9 @@ def load_spec(filename: str) -> mujoco.MjSpec:
     """A model file of the installed gymnasium package, read without importing gymnasium."""
     spec = find_spec("gymnasium")
     if spec is None or not spec.submodule_search_locations:
-        raise ModuleNotFoundError("the model files come from the package gymnasium, which is not installed")
+        raise ModuleNotFoundError(
+            "the model files come from the package gymnasium, which is not installed"
+        )
     path = Path(spec.submodule_search_locations[0]) / "envs" / "mujoco" / "assets" / filename
     return mujoco.MjSpec.from_file(str(path))
 
@@ -77,7 +79,9 @@ class Task(Env):
         """What reward and observation use besides positions and velocities."""
         return Reads()
 
-    def _terms(self, before: PhysicsState, after: PhysicsState, action: Array, velocity: Array) -> dict[str, Array]:
+    def _terms(
+        self, before: PhysicsState, after: PhysicsState, action: Array, velocity: Array
+    ) -> dict[str, Array]:
         """The reward's terms, in the order of `TERMS`; their sum is the reward."""
         return {
             "reward_forward": self._forward_reward_weight * velocity[0],
@@ -109,7 +113,9 @@ class Task(Env):
     def observation_size(self) -> int:
         """Length of the observation."""
         nq, nv = self._physics.model.nq, self._physics.model.nv
-        return jax.eval_shape(lambda: self._observation(self._physics.at_pose(jnp.zeros(nq), jnp.zeros(nv)))).shape[0]
+        return jax.eval_shape(
+            lambda: self._observation(self._physics.at_pose(jnp.zeros(nq), jnp.zeros(nv)))
+        ).shape[0]
 
     @property
     def action_size(self) -> int:
@@ -135,7 +141,11 @@ class Task(Env):
 
     def set_state(self, state: State, qpos: ArrayLike, qvel: ArrayLike) -> State:
         """`state` moved to a pose, qpos [Q] and qvel [V], as Gymnasium's `set_state`; the solver starts cold."""
-        return self._at(self._physics.at_pose(jnp.asarray(qpos, state.obs.dtype), jnp.asarray(qvel, state.obs.dtype)))
+        return self._at(
+            self._physics.at_pose(
+                jnp.asarray(qpos, state.obs.dtype), jnp.asarray(qvel, state.obs.dtype)
+            )
+        )
 
     def step(self, state: State, action: Float[Array, " A"]) -> State:
         """One control interval of `dt` seconds. `done` is 1 where the task terminated; time limits are the rollout's."""
@@ -148,20 +158,32 @@ class Task(Env):
             obs=self._observation(after),
             reward=sum(terms.values()),
             done=self._is_over(after).astype(velocity.dtype),
-            metrics={**state.metrics, **terms, **self._whereabouts(self._position(after), velocity)},
+            metrics={
+                **state.metrics,
+                **terms,
+                **self._whereabouts(self._position(after), velocity),
+            },
         )
 
     def _at(self, physics: PhysicsState) -> State:
         zero, position = jnp.zeros((), physics.qpos.dtype), self._position(physics)
-        metrics = dict.fromkeys(self.TERMS, zero) | self._whereabouts(position, jnp.zeros_like(position))
+        metrics = dict.fromkeys(self.TERMS, zero) | self._whereabouts(
+            position, jnp.zeros_like(position)
+        )
         return State(physics, self._observation(physics), zero, zero, metrics)  # pyright: ignore[reportArgumentType]
 
     def _whereabouts(self, position: Array, velocity: Array) -> dict[str, Array]:
         named = {"position": position, "velocity": velocity}
-        return {f"{axis}_{what}": value[i] for what, value in named.items() for i, axis in enumerate("xy"[: self.AXES])}
+        return {
+            f"{axis}_{what}": value[i]
+            for what, value in named.items()
+            for i, axis in enumerate("xy"[: self.AXES])
+        }
 
     def _uniform(self, key: Array, size: int) -> Array:
-        return jax.random.uniform(key, (size,), minval=-self._reset_noise_scale, maxval=self._reset_noise_scale)
+        return jax.random.uniform(
+            key, (size,), minval=-self._reset_noise_scale, maxval=self._reset_noise_scale
+        )
 
 
 class HealthyTask(Task):
@@ -169,7 +191,15 @@ class HealthyTask(Task):
 
     TERMS = ("reward_forward", "reward_ctrl", "reward_survive")
 
-    def __init__(self, physics: Physics, version: str, *, healthy_reward: float = 1.0, terminate_when_unhealthy: bool = True, **parameters):
+    def __init__(
+        self,
+        physics: Physics,
+        version: str,
+        *,
+        healthy_reward: float = 1.0,
+        terminate_when_unhealthy: bool = True,
+        **parameters,
+    ):
         super().__init__(physics, version, **parameters)
         self._healthy_reward = healthy_reward
         self._terminate_when_unhealthy = terminate_when_unhealthy

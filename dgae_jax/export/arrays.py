@@ -13,11 +13,12 @@ from typing import Any
 import jax
 import numpy as np
 
-from dgae_jax.configs.build import make_task
-from dgae_jax.configs.config import Config, ConfigError
+from dgae_jax.configs.config import ConfigError
+from dgae_jax.configs.resolved import ResolvedConfig
 from dgae_jax.export.outside import policy as outside
+from dgae_jax.learn.build import make_task
 from dgae_jax.learn.normalizers import OBSERVATION_LIMIT
-from dgae_jax.maths.transport import NARROW, about_the_mean
+from dgae_jax.maths.transport import GAP_BIAS, centered_cumsum
 from dgae_jax.run.api import Policy
 from dgae_jax.run.engines import referee
 from dgae_jax.run.evaluation import time_limit
@@ -29,7 +30,7 @@ TOLERANCE = 1e-4
 """Largest difference between the arrays' outputs and those of the policy itself, absolute and relative."""
 
 
-def arrays_of(found: Trained, config: Config, index: int) -> Arrays:
+def arrays_of(found: Trained, config: ResolvedConfig, index: int) -> Arrays:
     """The arrays of one of the seeds trained side by side.
 
     Raises ConfigError if they do not do what the policy does, because a part of its networks is of another make.
@@ -42,11 +43,11 @@ def arrays_of(found: Trained, config: Config, index: int) -> Arrays:
         if config.critic.kind == "ordered":
             layers |= _in_order(layers)
         elif config.critic.kind == "sorted":
-            layers["critic_count"] = np.array([config.critic.quantiles])
+            layers["critic_count"] = np.array([config.critic.outputs])
     except KeyError as name:
         raise _foreign(found, f"{name} is missing") from name
     arrays = {
-        **_normaliser(policy.observations, int(env.observation_size)),  # pyright: ignore[reportArgumentType]
+        **_normaliser(policy.obs_stats, int(env.observation_size)),  # pyright: ignore[reportArgumentType]
         **layers,
         "action_low": np.asarray(low, np.float32),
         "action_high": np.asarray(high, np.float32),
@@ -78,14 +79,21 @@ def _layers(network: str, params: Any) -> Arrays:
     torso, head = (params["params"].get(name, {}) for name in ("Torso_0", "Dense_0"))
     layers = [*(torso[f"Dense_{i}"] for i in range(len(torso))), head]
     parts = {"weight": "kernel", "bias": "bias"}
-    return {f"{network}_{ours}_{i}": np.asarray(layer[name]) for i, layer in enumerate(layers) for ours, name in parts.items()}
+    return {
+        f"{network}_{ours}_{i}": np.asarray(layer[name])
+        for i, layer in enumerate(layers)
+        for ours, name in parts.items()
+    }
 
 
 def _in_order(layers: Arrays) -> Arrays:
-    """What makes the critic's outputs quantiles in order (`maths.transport.in_order`): its last bias, and the matrix of the steps."""
+    """What makes the critic's outputs quantiles in order (`maths.transport.monotone_quantiles`): its last bias, and the matrix of the steps."""
     last = [name for name in layers if name.startswith("critic_bias_")][-1]
-    narrow = layers[last] - np.float32(NARROW) * (np.arange(layers[last].size) > 0)
-    return {last: narrow.astype(np.float32), "critic_steps": np.asarray(about_the_mean(narrow.size), np.float32)}
+    narrow = layers[last] - np.float32(GAP_BIAS) * (np.arange(layers[last].size) > 0)
+    return {
+        last: narrow.astype(np.float32),
+        "critic_steps": np.asarray(centered_cumsum(narrow.size), np.float32),
+    }
 
 
 def _compare(arrays: Arrays, policy: Policy, found: Trained) -> None:
@@ -93,7 +101,10 @@ def _compare(arrays: Arrays, policy: Policy, found: Trained) -> None:
     spread = np.random.default_rng(0).normal(size=(100, policy.observation_size))
     obs = arrays["observation_mean"] + 3 * spread * arrays["observation_std"]
     try:
-        outputs = {"actions": (ours(obs), policy(obs)), "quantiles": (ours.quantiles(obs), policy.quantiles(obs))}
+        outputs = {
+            "actions": (ours(obs), policy(obs)),
+            "quantiles": (ours.quantiles(obs), policy.quantiles(obs)),
+        }
     except ValueError as reason:
         raise _foreign(found, "as plain layers they do not fit together") from reason
     for name, (a, b) in outputs.items():
@@ -102,4 +113,6 @@ def _compare(arrays: Arrays, policy: Policy, found: Trained) -> None:
 
 
 def _foreign(found: Trained, why: str) -> ConfigError:
-    return ConfigError(f"{found.path}: must have networks of dgae_jax's own make to be exported; {why}")
+    return ConfigError(
+        f"{found.path}: must have networks of dgae_jax's own make to be exported; {why}"
+    )

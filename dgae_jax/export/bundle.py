@@ -6,7 +6,7 @@ from importlib import resources
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from dgae_jax.configs.config import Config
+from dgae_jax.configs.resolved import ResolvedConfig
 from dgae_jax.export import graph
 from dgae_jax.export.arrays import Arrays, arrays_of, packed
 from dgae_jax.export.card import card
@@ -22,7 +22,7 @@ class Exported(NamedTuple):
     """One policy, ready to be written in any format."""
 
     arrays: Arrays
-    config: Config
+    config: ResolvedConfig
     facts: Facts
 
 
@@ -32,31 +32,51 @@ def _npz(policy: Exported) -> dict[str, bytes]:
 
 def _onnx(policy: Exported) -> dict[str, bytes]:
     facts, config = policy.facts, policy.config
-    about = {"task": str(policy.arrays["env"]), "algorithm": str(config.algo), "samples": facts.samples, "git_revision": facts.git_revision}
-    return {"policy.onnx": graph.model(policy.arrays, {name: str(value) for name, value in about.items() if value is not None})}
+    about = {
+        "task": str(policy.arrays["env"]),
+        "algorithm": str(config.algo),
+        "samples": facts.samples,
+        "git_revision": facts.git_revision,
+    }
+    return {
+        "policy.onnx": graph.model(
+            policy.arrays, {name: str(value) for name, value in about.items() if value is not None}
+        )
+    }
 
 
 def _gymnasium(policy: Exported) -> dict[str, bytes]:
     before, after = _source("agent.py").split(IMPORT)
-    return {"policy.npz": packed(policy.arrays), "agent.py": f"{before}\n{inspect.getsource(Policy)}{after}".encode()}
+    return {
+        "policy.npz": packed(policy.arrays),
+        "agent.py": f"{before}\n{inspect.getsource(Policy)}{after}".encode(),
+    }
 
 
 def _source(name: str) -> str:
     return (resources.files("dgae_jax.export") / "outside" / name).read_text(encoding="utf-8")
 
 
-FILES: dict[str, Callable[[Exported], dict[str, bytes]]] = {"npz": _npz, "onnx": _onnx, "gymnasium": _gymnasium}
+FILES: dict[str, Callable[[Exported], dict[str, bytes]]] = {
+    "npz": _npz,
+    "onnx": _onnx,
+    "gymnasium": _gymnasium,
+}
 """The files of each format."""
 
 
-def export(source: Path, config: Config, which: str, index: int, formats: Sequence[str], out: Path) -> dict[str, list[str]]:
+def export(
+    source: Path, config: ResolvedConfig, which: str, index: int, formats: Sequence[str], out: Path
+) -> dict[str, list[str]]:
     """Write the directories `out`/FORMAT and name the files in each; nothing is written before all is made.
 
     `source` is a run directory or a policy's file, `index` that among the seeds trained side by side. Raises as
     `restore.trained` and `arrays_of`, OSError where a file cannot be written.
     """
     found = restore.trained(source, config, which)
-    policy = Exported(arrays_of(found, config, index), config, facts_of(source, found.path, config, index))
+    policy = Exported(
+        arrays_of(found, config, index), config, facts_of(source, found.path, config, index)
+    )
     made: dict[str, dict[str, Any]] = {}
     for kind in formats:
         text = card(kind, policy.arrays, config, index, policy.facts, which)

@@ -5,7 +5,7 @@ from dataclasses import asdict
 
 import numpy as np
 
-from dgae_jax.configs.config import Config
+from dgae_jax.configs.resolved import ResolvedConfig
 from dgae_jax.export.facts import Facts
 from dgae_jax.run.engines import engines_of, referee
 
@@ -51,9 +51,20 @@ USE = {"npz": NPZ, "onnx": ONNX, "gymnasium": GYMNASIUM}
 """How each export is used."""
 
 
-def card(kind: str, arrays: Mapping[str, np.ndarray], config: Config, index: int, facts: Facts, which: str) -> str:
+def card(
+    kind: str,
+    arrays: Mapping[str, np.ndarray],
+    config: ResolvedConfig,
+    index: int,
+    facts: Facts,
+    which: str,
+) -> str:
     """The text of `README.md` for the export `kind` of the checkpoint `which`."""
-    sizes = {"observations": arrays["observation_mean"].size, "actions": arrays["action_low"].size, "quantiles": _quantiles(arrays)}
+    sizes = {
+        "observations": arrays["observation_mean"].size,
+        "actions": arrays["action_low"].size,
+        "quantiles": _quantiles(arrays),
+    }
     task, engine = referee(config), engines_of(config)[0]
     chosen = ", episodes which chose this checkpoint" if which == "best" else ""
     rows = {
@@ -61,9 +72,12 @@ def card(kind: str, arrays: Mapping[str, np.ndarray], config: Config, index: int
         f"actions [{sizes['actions']}]",
         "algorithm": str(config.algo),
         "trained on": f"{config.task}, engine {config.physics}, seed {config.seed + index}",
-        "noise in training": ", ".join(f"{where} {std:g}" for where, std in asdict(config.noise).items() if std),
+        "noise in training": ", ".join(
+            f"{where} {std:g}" for where, std in asdict(config.noise).items() if std
+        ),
         "samples": facts.samples and f"{facts.samples:,}",
-        f"return in {task} ({engine})": facts.returns and f"{facts.returns}, mean ± standard deviation{chosen}",
+        f"return in {task} ({engine})": facts.returns
+        and f"{facts.returns}, mean ± standard deviation{chosen}",
         "critic": f"{config.critic.kind} [{sizes['quantiles']}], of the discounted return (γ = {config.gamma:g}){_scale(config)}",
         "checkpoint": facts.checkpoint,
         "trained with": ", ".join(f"{name} {version}" for name, version in facts.versions.items()),
@@ -83,5 +97,7 @@ def _quantiles(arrays: Mapping[str, np.ndarray]) -> int:
     return biases[-1].size
 
 
-def _scale(config: Config) -> str:
-    return " of rewards divided by a standard deviation of returns" if config.normalize_rewards else ""
+def _scale(config: ResolvedConfig) -> str:
+    return (
+        " of rewards divided by a standard deviation of returns" if config.normalize_rewards else ""
+    )

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from dgae_jax.configs.config import Config
+from dgae_jax.configs.resolved import ResolvedConfig
 from dgae_jax.maths.risk import weights_of
 from dgae_jax.maths.transport import directional_metric
 from dgae_jax.run import restore
@@ -26,7 +26,7 @@ class Actor(NamedTuple):
 
     title: str
     policy: Policy
-    config: Config
+    config: ResolvedConfig
     reward_std: float
     """What the critic's rewards are divided by."""
 
@@ -61,25 +61,37 @@ class Shots(NamedTuple):
     """Longest part of an episode that is shown, in its own time [s]."""
 
 
-def of_runs(runs: list[tuple[str, Path, Config]], which: str, index: int, shots: Shots) -> Iterator[list[Episode]]:
+def of_runs(
+    runs: list[tuple[str, Path, ResolvedConfig]], which: str, index: int, shots: Shots
+) -> Iterator[list[Episode]]:
     """One list after the other, each of the same initial state played by all runs (title, directory, configuration).
 
     `index` is that among the seeds trained side by side. Raises as `restore.trained`.
     """
-    cast = [_actor(title, restore.trained(path, config, which), config, index) for title, path, config in runs]
+    cast = [
+        _actor(title, restore.trained(path, config, which), config, index)
+        for title, path, config in runs
+    ]
     yield from _played(cast, shots)
 
 
-def of_checkpoints(path: Path, config: Config, index: int, shots: Shots) -> Iterator[list[Episode]]:
+def of_checkpoints(
+    path: Path, config: ResolvedConfig, index: int, shots: Shots
+) -> Iterator[list[Episode]]:
     """The policy at each checkpoint that the run keeps, one after the other, oldest first. Raises as `restore.kept`."""
     for found in restore.kept(path, config):
         samples = int(found.path.stem.removeprefix("steps_"))
         yield from _played([_actor(f"after {samples:,} samples", found, config, index)], shots)
 
 
-def _actor(title: str, found: restore.Trained, config: Config, index: int) -> Actor:
+def _actor(title: str, found: restore.Trained, config: ResolvedConfig, index: int) -> Actor:
     policy, critic = jax.tree.map(lambda x: x[index], (found.policy, found.critic))
-    return Actor(title, Policy(policy, critic, config), config, float(restore.reward_std(found.path, config)[index]))
+    return Actor(
+        title,
+        Policy(policy, critic, config),
+        config,
+        float(restore.reward_std(found.path, config)[index]),
+    )
 
 
 def _played(cast: list[Actor], shots: Shots) -> Iterator[list[Episode]]:
@@ -95,7 +107,9 @@ def play(actor: Actor, number: int, seconds: float) -> Episode:
     """
     config, world = actor.config, _world(actor.config)
     shown = min(config.episode_length, max(1, math.floor(seconds / world.unwrapped.dt)))
-    states, rewards, fell = _steps(world, actor.policy, number, shown + steps_that_count(config.gamma))
+    states, rewards, fell = _steps(
+        world, actor.policy, number, shown + steps_that_count(config.gamma)
+    )
     observed, qpos, qvel = (np.stack(part[:shown]) for part in zip(*states, strict=True))
     quantiles = np.sort(actor.policy.quantiles(observed))
     weights = weights_of(config.metric, quantiles.shape[-1])
@@ -107,7 +121,9 @@ def play(actor: Actor, number: int, seconds: float) -> Episode:
         qvel=qvel,
         total=np.cumsum([0.0, *rewards])[: len(qpos)],
         quantiles=quantiles,
-        value=np.asarray(directional_metric(jnp.asarray(quantiles), jnp.zeros_like(quantiles), weights)),
+        value=np.asarray(
+            directional_metric(jnp.asarray(quantiles), jnp.zeros_like(quantiles), weights)
+        ),
         came=returns_from(rewards, config.gamma)[: len(qpos)] / actor.reward_std,
     )
 
@@ -120,15 +136,17 @@ def returns_from(rewards: list[float], gamma: float) -> Float[np.ndarray, " T"]:
     return out
 
 
-def _world(config: Config) -> Any:
+def _world(config: ResolvedConfig) -> Any:
     import gymnasium  # here, so that the module can be imported to look at its records
 
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # that v4 is not the newest version is known
+        warnings.simplefilter("ignore")  # that v4 is not the latest version is known
         return gymnasium.make(referee(config), max_episode_steps=config.episode_length + LONGEST)
 
 
-def _steps(world: Any, policy: Callable[[Any], np.ndarray], number: int, longest: int) -> tuple[list[tuple], list[float], bool]:
+def _steps(
+    world: Any, policy: Callable[[Any], np.ndarray], number: int, longest: int
+) -> tuple[list[tuple], list[float], bool]:
     """States (observation, qpos, qvel), the reward that followed each, and whether the last one was the end of the robot's health."""
     data = world.unwrapped.data
     obs, _ = world.reset(seed=number)

@@ -4,7 +4,7 @@ import re
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from dgae_jax.configs.config import Config
+from dgae_jax.configs.resolved import ResolvedConfig
 from dgae_jax.run import files, manifest
 from dgae_jax.run.evaluations import EvaluationsFile
 from dgae_jax.run.summary import counted
@@ -23,7 +23,7 @@ class Facts(NamedTuple):
     git_revision: str | None
 
 
-def facts_of(source: Path, found: Path, config: Config, index: int) -> Facts:
+def facts_of(source: Path, found: Path, config: ResolvedConfig, index: int) -> Facts:
     """`source` is a run directory or a policy's file, `found` the file that holds the networks."""
     seed = config.seed + index
     if source.is_file():
@@ -53,13 +53,21 @@ def _row_of_study(source: Path, seed: int) -> dict[str, Any]:
     study, name = source.resolve().parent.parent, f"{source.resolve().parent.name}/{source.name}"
     if not (study / "results.jsonl").is_file():
         return {}
-    rows = [row for row, _ in files.whole_rows(study / "results.jsonl") if (row.get("policy"), row.get("seed")) == (name, seed)]
+    rows = [
+        row
+        for row, _ in files.whole_rows(study / "results.jsonl")
+        if (row.get("policy"), row.get("seed")) == (name, seed)
+    ]
     return rows[-1] if rows else {}
 
 
 def _returns(evaluation: Any) -> str | None:
     try:
-        mean, std, episodes = evaluation["return_mean"], evaluation["return_std"], len(evaluation["returns"])
+        mean, std, episodes = (
+            evaluation["return_mean"],
+            evaluation["return_std"],
+            len(evaluation["returns"]),
+        )
         return f"{mean:,.1f} ± {std:,.1f} over {counted(episodes, 'episode')}"
     except (TypeError, KeyError, ValueError):
         return None

@@ -33,7 +33,9 @@ class Size(NamedTuple):
     height: int
 
 
-def film(scenes: Iterable[list[Episode]], size: Size, fps: float, watch: Watch = unwatched) -> Iterator[Frame]:
+def film(
+    scenes: Iterable[list[Episode]], size: Size, fps: float, watch: Watch = unwatched
+) -> Iterator[Frame]:
     """The frames, in the episodes' own time: scenes one after the other, the episodes of each side by side."""
     with ExitStack() as stack:
         stages: dict[tuple, Stage] = {}
@@ -42,8 +44,13 @@ def film(scenes: Iterable[list[Episode]], size: Size, fps: float, watch: Watch =
             for episode in scene:
                 key = _stage_of(episode)
                 if key not in stages:
-                    stages[key] = stack.enter_context(Stage(*key, width=size.width, height=size.height))
-            for frame in side_by_side([_panels(each, stages[_stage_of(each)], size, fps) for each in scene], round(HOLD * fps)):
+                    stages[key] = stack.enter_context(
+                        Stage(*key, width=size.width, height=size.height)
+                    )
+            for frame in side_by_side(
+                [_panels(each, stages[_stage_of(each)], size, fps) for each in scene],
+                round(HOLD * fps),
+            ):
                 if count % SAY_EVERY == 0:
                     watch(f"drawing episode {number}, frame {count:,}")
                 count += 1

@@ -15,7 +15,9 @@ VARIABLE = "MUJOCO_GL"
 CANDIDATES = ("cgl",) if sys.platform == "darwin" else ("egl", "osmesa")
 """In this order: EGL draws on a GPU if there is one, OSMesa always on the CPU."""
 
-_TRIAL = "import mujoco; mujoco.Renderer(mujoco.MjModel.from_xml_string('<mujoco/>'), 16, 16).render()"
+_TRIAL = (
+    "import mujoco; mujoco.Renderer(mujoco.MjModel.from_xml_string('<mujoco/>'), 16, 16).render()"
+)
 
 _PATIENCE = 60
 """Seconds after which a candidate that hangs counts as broken."""
@@ -37,13 +39,23 @@ def choose() -> str:
             os.environ[VARIABLE] = backend
             return backend
     tried = " nor ".join(CANDIDATES)
-    raise ConfigError(f"{VARIABLE}: neither {tried} draws a picture here; on Debian: apt install libegl1 libgl1-mesa-dri, or libosmesa6")
+    raise ConfigError(
+        f"{VARIABLE}: neither {tried} draws a picture here; on Debian: apt install libegl1 libgl1-mesa-dri, or libosmesa6"
+    )
 
 
 def draws(backend: str) -> bool:
     """Whether a process with this backend can draw a picture."""
     try:
         environment = {**os.environ, VARIABLE: backend}
-        return subprocess.run([sys.executable, "-c", _TRIAL], env=environment, capture_output=True, timeout=_PATIENCE).returncode == 0
+        return (
+            subprocess.run(
+                [sys.executable, "-c", _TRIAL],
+                env=environment,
+                capture_output=True,
+                timeout=_PATIENCE,
+            ).returncode
+            == 0
+        )
     except subprocess.TimeoutExpired:
         return False

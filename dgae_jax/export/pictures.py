@@ -37,5 +37,12 @@ def save(figure: Figure, path: Path, dpi: int = 200) -> None:
     """Write a PNG or an SVG, as the name of the file ends, complete or not at all. Raises OSError if it cannot be written."""
     image, kind = io.BytesIO(), path.suffix[1:]
     with matplotlib.rc_context(PAPER):
-        figure.savefig(image, format=kind, dpi=dpi, metadata=_UNDATED[kind], bbox_inches="tight", pad_inches=0.03)
+        figure.savefig(
+            image,
+            format=kind,
+            dpi=dpi,
+            metadata=_UNDATED[kind],
+            bbox_inches="tight",
+            pad_inches=0.03,
+        )
     files.replace(path, image.getvalue())

@@ -26,7 +26,9 @@ def figure() -> Figure:
     """Four panels, (a) to (d), each with the name of its robot below."""
     with matplotlib.rc_context(PAPER):
         sheet = Figure(figsize=(7.2, 2.1), layout="constrained")
-        for axes, letter, (env, name) in zip(sheet.subplots(1, 4), "abcd", NAMES.items(), strict=True):
+        for axes, letter, (env, name) in zip(
+            sheet.subplots(1, 4), "abcd", NAMES.items(), strict=True
+        ):
             axes.imshow(_panel(env))
             axes.set(xticks=[], yticks=[])
             axes.set_xlabel(f"({letter}) {name}", labelpad=4)

@@ -19,7 +19,9 @@ class Sb3VecEnv(VecEnv):
     def __init__(self, env: VectorEnv):
         mode = env.metadata.get("autoreset_mode")
         if mode is not AutoresetMode.SAME_STEP:
-            raise invalid("autoreset_mode", getattr(mode, "value", mode), AutoresetMode.SAME_STEP.value)
+            raise invalid(
+                "autoreset_mode", getattr(mode, "value", mode), AutoresetMode.SAME_STEP.value
+            )
         self.env = env
         super().__init__(env.num_envs, env.single_observation_space, env.single_action_space)
 
@@ -66,7 +68,9 @@ class Sb3VecEnv(VecEnv):
         """Raises NotImplementedError: worlds share all attributes."""
         raise NotImplementedError(f"{attr_name}: worlds share one environment, set it there")
 
-    def env_method(self, method_name: str, *method_args, indices=None, **method_kwargs) -> list[Any]:
+    def env_method(
+        self, method_name: str, *method_args, indices=None, **method_kwargs
+    ) -> list[Any]:
         """Raises NotImplementedError: a world is no object of its own."""
         raise NotImplementedError(f"{method_name}: worlds share one environment, call it there")
 

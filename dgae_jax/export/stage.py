@@ -70,14 +70,20 @@ class Stage:
         """Free the OpenGL context."""
         self._renderer.close()
 
-    def picture(self, qpos: Float[np.ndarray, " Q"], qvel: Float[np.ndarray, " V"] | None = None) -> UInt8[np.ndarray, "H W 3"]:
+    def picture(
+        self, qpos: Float[np.ndarray, " Q"], qvel: Float[np.ndarray, " V"] | None = None
+    ) -> UInt8[np.ndarray, "H W 3"]:
         """The robot at these positions (m, rad) and velocities, by default at rest."""
         self._data.qpos[:] = qpos
         self._data.qvel[:] = 0 if qvel is None else qvel
         mujoco.mj_forward(self.model, self._data)
         x, y, _ = self._data.body("torso").subtree_com
         self._camera.lookat[:] = x, y, self._height
-        self._data.light_xpos[:] = x, y, LAMP_HEIGHT  # a lamp that stays behind casts no shadow here
+        self._data.light_xpos[:] = (
+            x,
+            y,
+            LAMP_HEIGHT,
+        )  # a lamp that stays behind casts no shadow here
         self._renderer.update_scene(self._data, self._camera)
         return self._renderer.render().copy()
 

@@ -64,10 +64,14 @@ def renew(env: Env, worlds: Worlds, mask: Bool[Array, " N"]) -> Worlds:
 def _fresh(env: Env, keys: Key[Array, " N"]) -> Worlds:
     reset, rest = jnp.moveaxis(jax.vmap(jax.random.split)(keys), 1, 0)
     count = len(keys)
-    return Worlds(jax.vmap(env.reset)(reset), jnp.zeros(count, jnp.int32), jnp.full(count, False), rest)
+    return Worlds(
+        jax.vmap(env.reset)(reset), jnp.zeros(count, jnp.int32), jnp.full(count, False), rest
+    )
 
 
-def disabled(env: Env, limit: int, worlds: Worlds, action: Float[Array, "N A"]) -> tuple[Worlds, Step]:
+def disabled(
+    env: Env, limit: int, worlds: Worlds, action: Float[Array, "N A"]
+) -> tuple[Worlds, Step]:
     """One step in every world; a world whose episode ends stays there.
 
     A world that turns non-finite ends its episode as terminated with reward 0 and shows the observation before, as in training.
@@ -83,16 +87,22 @@ def disabled(env: Env, limit: int, worlds: Worlds, action: Float[Array, "N A"]) 
     return moved, Step(obs, reward, terminated, truncated, {**metrics, "nonfinite": ~valid})
 
 
-def same_step(env: Env, limit: int, worlds: Worlds, action: Float[Array, "N A"]) -> tuple[Worlds, Step]:
+def same_step(
+    env: Env, limit: int, worlds: Worlds, action: Float[Array, "N A"]
+) -> tuple[Worlds, Step]:
     """A world whose episode ends is at the beginning of the next one after the same step."""
     moved, step = disabled(env, limit, worlds, action)
     return renew(env, moved, moved.over), step
 
 
-def next_step(env: Env, limit: int, worlds: Worlds, action: Float[Array, "N A"]) -> tuple[Worlds, Step]:
+def next_step(
+    env: Env, limit: int, worlds: Worlds, action: Float[Array, "N A"]
+) -> tuple[Worlds, Step]:
     """A world whose episode has ended begins the next one instead of a step, whatever its action; that step shows zeros."""
     moved, step = disabled(env, limit, worlds, action)
-    return where(worlds.over, renew(env, worlds, worlds.over), moved), where(worlds.over, jax.tree.map(jnp.zeros_like, step), step)
+    return where(worlds.over, renew(env, worlds, worlds.over), moved), where(
+        worlds.over, jax.tree.map(jnp.zeros_like, step), step
+    )
 
 
 MODES: dict[str, Advance] = {"NextStep": next_step, "SameStep": same_step, "Disabled": disabled}

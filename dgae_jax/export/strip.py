@@ -41,9 +41,16 @@ class Strip:
         self._several = episode.quantiles.shape[-1] > 1
         _legend(self._figure, size, episode)
         room = int(0.5 * width / (0.85 * size))
-        self._figure.text(0.02, 0.97, shortened(episode.actor.title, room), size=size + 1, weight="bold", va="top")
-        self._numbers = self._figure.text(0.98, 0.97, "", size=size + 1, va="top", ha="right", animated=True)
-        self._lines = [self._vertical(COLOURS["black"], _DASHED), self._vertical(COLOURS["vermilion"], "-")]
+        self._figure.text(
+            0.02, 0.97, shortened(episode.actor.title, room), size=size + 1, weight="bold", va="top"
+        )
+        self._numbers = self._figure.text(
+            0.98, 0.97, "", size=size + 1, va="top", ha="right", animated=True
+        )
+        self._lines = [
+            self._vertical(COLOURS["black"], _DASHED),
+            self._vertical(COLOURS["vermilion"], "-"),
+        ]
         if self._several:
             self._add_distribution(episode)
         self._canvas.draw()
@@ -56,7 +63,9 @@ class Strip:
         if self._several:
             z = episode.quantiles[t]
             self._fill.set_data(self._x, 0, density(z, self._x) / self._highest)
-            self._rug.set_segments([[(at, 0), (at, -RUG * w)] for at, w in zip(z, self._weights, strict=True)])
+            self._rug.set_segments(
+                [[(at, 0), (at, -RUG * w)] for at, w in zip(z, self._weights, strict=True)]
+            )
             self._axes.draw_artist(self._fill)
             self._axes.draw_artist(self._rug)
         for line, at in zip(self._lines, (episode.value[t], episode.came[t]), strict=True):
@@ -68,7 +77,9 @@ class Strip:
         return np.asarray(self._canvas.buffer_rgba())[..., :3].copy()
 
     def _vertical(self, colour: str, style: Any) -> Line2D:
-        (line,) = self._axes.plot([], [], color=colour, linestyle=style, linewidth=1.6, animated=True)
+        (line,) = self._axes.plot(
+            [], [], color=colour, linestyle=style, linewidth=1.6, animated=True
+        )
         line.set_ydata([-RUG, 1.1])
         line.set_xdata([0, 0])
         return line
@@ -80,16 +91,24 @@ class Strip:
         self._weights = np.ones(count) if weights is None else weights / weights.max()
         low, high = self._axes.get_xlim()
         self._x = np.linspace(low, high, POINTS)
-        self._highest = np.quantile([density(z, self._x).max() for z in episode.quantiles[::10]], 0.9)
-        self._fill = self._axes.fill_between(self._x, 0, 0 * self._x, color=COLOURS["sky"], alpha=0.6, linewidth=0, animated=True)
+        self._highest = np.quantile(
+            [density(z, self._x).max() for z in episode.quantiles[::10]], 0.9
+        )
+        self._fill = self._axes.fill_between(
+            self._x, 0, 0 * self._x, color=COLOURS["sky"], alpha=0.6, linewidth=0, animated=True
+        )
         self._rug = LineCollection([], colors=COLOURS["blue"], linewidths=0.7, animated=True)
         self._axes.add_collection(self._rug, autolim=False)
 
 
-def density(quantiles: Float[np.ndarray, " K"], x: Float[np.ndarray, " P"]) -> Float[np.ndarray, " P"]:
+def density(
+    quantiles: Float[np.ndarray, " K"], x: Float[np.ndarray, " P"]
+) -> Float[np.ndarray, " P"]:
     """That of the quantiles by normal kernels of Silverman's width, at least two steps between points wide."""
     width = max(1.06 * quantiles.std() * len(quantiles) ** -0.2, 2 * (x[1] - x[0]))
-    return np.exp(-0.5 * ((x[:, None] - quantiles) / width) ** 2).mean(-1) / (width * np.sqrt(2 * np.pi))
+    return np.exp(-0.5 * ((x[:, None] - quantiles) / width) ** 2).mean(-1) / (
+        width * np.sqrt(2 * np.pi)
+    )
 
 
 def shortened(text: str, room: int) -> str:
@@ -117,7 +136,9 @@ def _axes(figure: Figure, size: float, limits: tuple[float, float]) -> Any:
 
 def _legend(figure: Figure, size: float, episode: Episode) -> None:
     several = episode.quantiles.shape[-1] > 1
-    distribution = [Patch(color=COLOURS["sky"], alpha=0.6, label="critic's distribution")] if several else []
+    distribution = (
+        [Patch(color=COLOURS["sky"], alpha=0.6, label="critic's distribution")] if several else []
+    )
     name = f"its {episode.actor.config.metric}" if several else "critic's value"
     value = Line2D([], [], color=COLOURS["black"], linestyle=_DASHED, linewidth=1.6, label=name)
     came = Line2D([], [], color=COLOURS["vermilion"], linewidth=1.6, label="return that came")

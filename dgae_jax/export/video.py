@@ -38,10 +38,14 @@ def check_extra() -> None:
     """Raise ConfigError, saying what to install, unless an MP4 can be encoded here."""
     for module, package in (("mediapy", "mediapy"), ("imageio_ffmpeg", "imageio-ffmpeg")):
         if find_spec(module) is None:
-            raise ConfigError(f'{package} is not installed, which encodes videos: pip install "dgae_jax[video]", or use --format gif')
+            raise ConfigError(
+                f'{package} is not installed, which encodes videos: pip install "dgae_jax[video]", or use --format gif'
+            )
 
 
-def write(frames: Iterable[np.ndarray], stem: Path, formats: tuple[str, ...], fps: float) -> list[Path]:
+def write(
+    frames: Iterable[np.ndarray], stem: Path, formats: tuple[str, ...], fps: float
+) -> list[Path]:
     """Write `stem`.mp4 and `stem`.gif, each whole or not at all, and name them. Frames [H, W, 3] are uint8, H and W even.
 
     Nothing is written before all is encoded. Raises OSError for a file that cannot be written, ValueError without frames.
@@ -78,7 +82,11 @@ def _mp4(frames: Iterable[np.ndarray], shape: tuple[int, ...], fps: float) -> by
     mediapy.set_ffmpeg(imageio_ffmpeg.get_ffmpeg_exe())
     with tempfile.TemporaryDirectory() as directory:
         path = Path(directory) / "film.mp4"
-        how: dict[str, Any] = {"fps": fps, "crf": QUALITY, "ffmpeg_args": ["-movflags", "+faststart"]}
+        how: dict[str, Any] = {
+            "fps": fps,
+            "crf": QUALITY,
+            "ffmpeg_args": ["-movflags", "+faststart"],
+        }
         with mediapy.VideoWriter(path, (shape[0], shape[1]), **how) as writer:
             for frame in frames:
                 writer.add_image(frame)
@@ -123,5 +131,7 @@ def _gif(images: list[Any], colours: int, fps: float) -> bytes:
     palette = sheet.quantize(colours, method=Image.Quantize.FASTOCTREE)
     first, *rest = (image.quantize(palette=palette, dither=Image.Dither.NONE) for image in images)
     out = io.BytesIO()
-    first.save(out, "GIF", save_all=True, append_images=rest, duration=round(100 / fps) * 10, loop=0)
+    first.save(
+        out, "GIF", save_all=True, append_images=rest, duration=round(100 / fps) * 10, loop=0
+    )
     return out.getvalue()

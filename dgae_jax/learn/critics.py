@@ -1,14 +1,15 @@
-"""Critics are a network, a target and a distance: scalar values are the case of one quantile and a squared distance."""
+"""Critics: a network, a target and a loss. A scalar critic is one quantile and a squared error."""
 
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
+import flax.linen as nn
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
 from dgae_jax.learn.networks import Torso, value_network
-from dgae_jax.learn.types import Batch, Critic, Params
+from dgae_jax.learn.types import Batch, Critic, Params, Residual, TargetFn
 from dgae_jax.maths.returns import (
     bellman_target,
     distributional_td_residual,
@@ -17,21 +18,19 @@ from dgae_jax.maths.returns import (
     sr_lambda_target,
     td_residual,
 )
-from dgae_jax.maths.transport import in_order, quantile_huber_loss
+from dgae_jax.maths.transport import monotone_quantiles, quantile_huber_loss
 
 
 class Target(NamedTuple):
     """The target of a critic's fit."""
 
-    compute: Callable
-    """`compute(key, reward, discount, trace, quantiles, next_quantiles) -> [T, N, J]`, one signature for all."""
+    compute: TargetFn
     recompute: bool = False
-    """Whether it is computed at every gradient step with the current critic, or once per iteration with the critic that acted.
-
-    Only for one-step targets: a shuffled minibatch has neither key nor trace, which are None then, as are the quantiles.
-    """
+    """True to compute it at every gradient step with the current critic; False to compute it once
+    per iteration with the critic at rollout time. One-step targets only: a shuffled minibatch has
+    no key, trace and quantiles, which are None then."""
     lam: float | None = None
-    """λ of the trace where it is not that of the advantages."""
+    """λ of the trace where it differs from that of the advantages."""
 
 
 def _bellman(key, reward, discount, trace, quantiles, next_quantiles):
@@ -50,85 +49,160 @@ def _lambda_return(key, reward, discount, trace, quantiles, next_quantiles):
     return lambda_return(reward, discount, trace, quantiles, next_quantiles)[..., None]
 
 
-BELLMAN = Target(_bellman, recompute=True)
-BELLMAN_FROZEN = Target(_bellman)
-LAMBDA_SHIFT = Target(_lambda_shift)
-SR_LAMBDA = Target(_sr_lambda)
-MONTE_CARLO = Target(_sr_lambda, lam=1.0)
-LAMBDA_RETURN = Target(_lambda_return)
+TARGETS: dict[str, Target] = {
+    "bellman": Target(_bellman, recompute=True),
+    "bellman-frozen": Target(_bellman),
+    "lambda-shift": Target(_lambda_shift),
+    "sr-lambda": Target(_sr_lambda),
+    "lambda-return": Target(_lambda_return),
+    "monte-carlo": Target(_sr_lambda, lam=1.0),
+}
+
+Error = Callable[[Array, Array, Array], Float[Array, " B"]]
+"""`error(quantiles [B, K], target [B, J], value [B]) -> [B]`: loss of each sample."""
 
 
 def _critic(
-    obs_size: int, outputs: int, hidden: Sequence[int], torso: Callable, target: Target, distance: Callable, head: Callable = jnp.asarray
+    obs_size: int,
+    outputs: int,
+    hidden: Sequence[int],
+    torso: Callable[[Sequence[int]], nn.Module],
+    target: Target,
+    error: Error,
+    head: Callable[[Array], Array] = jnp.asarray,
 ) -> Critic:
     network = value_network(obs_size, outputs, hidden=hidden, torso=torso)
 
     def predict(params: Params, obs: Array) -> Array:
         return head(network.apply(params, obs))
 
-    def fitted_to(params: Params, batch: Batch) -> Array:
+    def target_of(params: Params, batch: Batch) -> Array:
         if not target.recompute:
             return batch.target
-        following = jax.lax.stop_gradient(predict(params, batch.next_obs))
-        return target.compute(None, batch.reward, batch.discount, None, None, following)
+        next_quantiles = jax.lax.stop_gradient(predict(params, batch.next_obs))
+        return target.compute(None, batch.reward, batch.discount, None, None, next_quantiles)
 
     def loss(params: Params, batch: Batch):
-        apart = distance(predict(params, batch.obs), fitted_to(params, batch), batch.value)
-        return jnp.where(batch.valid, apart, 0).mean(), {}
+        errors = error(predict(params, batch.obs), target_of(params, batch), batch.value)
+        return jnp.where(batch.mask, errors, 0).mean(), {}
 
     return Critic(network.init, predict, target.compute, loss, target.lam)
 
 
-def scalar(obs_size: int, *, hidden: Sequence[int], target: Target, torso: Callable = Torso) -> Critic:
-    """V(s), fitted by half the squared error; `torso` is the flax module of its `hidden` layers."""
+def scalar_critic(
+    obs_size: int,
+    *,
+    hidden: Sequence[int],
+    target: Target,
+    torso: Callable[[Sequence[int]], nn.Module] = Torso,
+) -> Critic:
+    """Build V(s), fitted by half the squared error.
 
-    def distance(value: Float[Array, "B 1"], target: Float[Array, "B 1"], before: Float[Array, " B"]) -> Float[Array, " B"]:
+    Args:
+        obs_size: length of an observation.
+        hidden: widths of the hidden layers.
+        target: target of the fit.
+        torso: flax module of the `hidden` layers.
+    """
+
+    def error(value: Array, target: Array, before: Array) -> Float[Array, " B"]:
         return 0.5 * ((value - target) ** 2).mean(-1)
 
-    return _critic(obs_size, 1, hidden, torso, target, distance)
+    return _critic(obs_size, 1, hidden, torso, target, error)
 
 
-def quantile(obs_size: int, *, hidden: Sequence[int], target: Target, quantiles: int, kappa: ArrayLike, torso: Callable = Torso) -> Critic:
-    """F⁻¹ of the return at K midpoints, fitted by the quantile-Huber loss (Eq. quantile_huber_loss); `torso` as for `scalar`."""
+def quantile_critic(
+    obs_size: int,
+    *,
+    hidden: Sequence[int],
+    target: Target,
+    quantiles: int,
+    kappa: ArrayLike,
+    torso: Callable[[Sequence[int]], nn.Module] = Torso,
+) -> Critic:
+    """Build F⁻¹ of the return at K midpoints, fitted by the quantile-Huber loss.
 
-    def distance(quantiles: Float[Array, "B K"], target: Float[Array, "B J"], before: Float[Array, " B"]) -> Float[Array, " B"]:
+    The loss is Eq. quantile_huber_loss of the paper.
+
+    Args:
+        obs_size: length of an observation.
+        hidden: widths of the hidden layers.
+        target: target of the fit.
+        quantiles: their number K.
+        kappa: threshold κ of the loss.
+        torso: flax module of the `hidden` layers.
+    """
+
+    def error(quantiles: Array, target: Array, before: Array) -> Float[Array, " B"]:
         return quantile_huber_loss(quantiles, target, kappa=kappa)
 
-    return _critic(obs_size, quantiles, hidden, torso, target, distance)
+    return _critic(obs_size, quantiles, hidden, torso, target, error)
 
 
-def sorted_quantile(obs_size: int, **options) -> Critic:
-    """`quantile`, whose outputs are sorted where they are used, which takes them as a whole no farther from the truth (Chernozhukov et
-    al. 2010).
+def sorted_critic(obs_size: int, **options) -> Critic:
+    """Build `quantile_critic` with sorted predictions.
+
+    Sorting takes a distribution no farther from the truth (Chernozhukov et al. 2010).
     """
-    plain = quantile(obs_size, **options)
-    return plain._replace(predict=lambda params, obs: jnp.sort(plain.predict(params, obs)))
+    unsorted = quantile_critic(obs_size, **options)
+    return unsorted._replace(predict=lambda params, obs: jnp.sort(unsorted.predict(params, obs)))
 
 
-_OF_SHAPE = 1 / 64
-"""Weight of the shape beside the mean, small so as to leave the layers that both share to the mean."""
+SHAPE_LOSS_WEIGHT = 1 / 64
+"""Small, so that the layers that both share are left to the mean."""
 
 
-def ordered(obs_size: int, *, hidden: Sequence[int], target: Target, quantiles: int, kappa: ArrayLike, torso: Callable = Torso) -> Critic:
-    """F⁻¹ of the return at K midpoints `in_order`: their mean is fitted by half the squared error, and their shape to how far
-    the targets lie from the mean that was predicted before the rollout was learned from, by the quantile-Huber loss over κ (Dabney et
-    al. 2018); `torso` as for `scalar`.
+def ordered_critic(
+    obs_size: int,
+    *,
+    hidden: Sequence[int],
+    target: Target,
+    quantiles: int,
+    kappa: ArrayLike,
+    torso: Callable[[Sequence[int]], nn.Module] = Torso,
+) -> Critic:
+    """Build F⁻¹ of the return at K `monotone_quantiles`; arguments as `quantile_critic`.
+
+    The mean is fitted by half the squared error. The shape is fitted to how far the targets lie
+    from the value estimate at rollout time, by the quantile-Huber loss over κ (Dabney et al. 2018).
     """
 
-    def distance(quantiles: Float[Array, "B K"], target: Float[Array, "B J"], before: Float[Array, " B"]) -> Float[Array, " B"]:
+    def error(quantiles: Array, target: Array, before: Array) -> Float[Array, " B"]:
         mean = quantiles.mean(-1)
-        shape = quantile_huber_loss(quantiles - mean[:, None], target - before[:, None], kappa=kappa) / kappa
+        shape = (
+            quantile_huber_loss(quantiles - mean[:, None], target - before[:, None], kappa=kappa)
+            / kappa
+        )
         scale = quantiles.shape[-1] / 2  # of the quantile-Huber loss of K equal quantiles, Σᵢ τ̂ᵢ
-        return scale * 0.5 * (mean - target.mean(-1)) ** 2 + _OF_SHAPE * shape
+        return scale * 0.5 * (mean - target.mean(-1)) ** 2 + SHAPE_LOSS_WEIGHT * shape
 
-    return _critic(obs_size, quantiles, hidden, torso, target, distance, head=in_order)
-
-
-def td(weights: ArrayLike | None) -> Callable[..., Array]:
-    """The scalar residual, of the means (below Eq. GAE); no metric."""
-    return lambda reward, discount, z, z_next: td_residual(reward, discount, z.mean(-1), z_next.mean(-1))
+    return _critic(obs_size, quantiles, hidden, torso, target, error, head=monotone_quantiles)
 
 
-def distributional(weights: ArrayLike | None) -> Callable[..., Array]:
-    """The distributional residual under the metric of these weights (Def. distributional_TD_error)."""
-    return lambda reward, discount, z, z_next: distributional_td_residual(reward, discount, z, z_next, weights)
+CRITICS: dict[str, Callable[..., Critic]] = {
+    "scalar": scalar_critic,
+    "quantile": quantile_critic,
+    "sorted": sorted_critic,
+    "ordered": ordered_critic,
+}
+"""`critic(obs_size, hidden=, target=, **options)`."""
+
+
+def td_error(weights: ArrayLike | None) -> Residual:
+    """Return the scalar TD error, of the means (below Eq. GAE); it has no metric."""
+    return lambda reward, discount, quantiles, next_quantiles: td_residual(
+        reward, discount, quantiles.mean(-1), next_quantiles.mean(-1)
+    )
+
+
+def distributional_td_error(weights: ArrayLike | None) -> Residual:
+    """Return the TD error under the metric of these weights (Def. distributional_TD_error)."""
+    return lambda reward, discount, quantiles, next_quantiles: distributional_td_residual(
+        reward, discount, quantiles, next_quantiles, weights
+    )
+
+
+RESIDUALS: dict[str, Callable[[ArrayLike | None], Residual]] = {
+    "td": td_error,
+    "distributional": distributional_td_error,
+}

@@ -1,12 +1,12 @@
-"""One program on several devices: who has which worlds, and who fits what.
+"""One program on several devices of a mesh with one axis.
 
-A mesh has one axis. Worlds are divided over it, and every device rolls out its own without a word to the others. What they saw is
-gathered on all of them, and estimates are made by each for itself. Of the two fits
+Envs are divided over the devices, and each rolls out its own without communication. The data are
+gathered on all of them, and each computes the estimates. Of the policy's and the critic's update
 
 - each has a CPU device of its own, because there a gradient step is too short to be shared;
 - accelerators share every minibatch, whose gradient XLA sums over them.
 
-Several runs side by side are divided instead, if their number allows it: then nothing is exchanged at all.
+Several seeds are divided instead, if their number allows it: then nothing is communicated at all.
 """
 
 import os
@@ -23,31 +23,30 @@ from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec
 AXIS = "devices"
 
 THREADS_PER_DEVICE = 2
-"""Of JAX's pool on a CPU."""
+"""Threads of JAX's CPU pool. A device that waits for another blocks a thread; with one thread per
+device the work that it waits for might never begin."""
 
 _MESH: ContextVar[Mesh | None] = ContextVar("mesh", default=None)
-"""Of the program that is being traced; None where a device is alone."""
+"""Mesh of the program that is being traced; None for a single device."""
 
 
 def divide_cpu(count: int) -> None:
-    """Let a CPU pose as so many devices; raises RuntimeError if JAX runs already.
-
-    A device that waits for another blocks a thread of JAX's pool. With only as many threads as devices, what the other one needs a
-    thread for might never begin, so there are more.
-    """
+    """Split the CPU into JAX devices; raise RuntimeError if JAX has started already."""
     jax.config.update("jax_num_cpu_devices", count)
     if count > 1 or jax.distributed.is_initialized():
         os.environ["PJRT_NPROC"] = str(THREADS_PER_DEVICE * count)
 
 
 def make_mesh(count: int) -> Mesh | None:
-    """The first `count` devices; None for a single one."""
-    return jax.make_mesh((count,), (AXIS,), (AxisType.Auto,), devices=jax.devices()[:count]) if count > 1 else None
+    """Return a mesh of the first `count` devices; None for a single one."""
+    if count == 1:
+        return None
+    return jax.make_mesh((count,), (AXIS,), (AxisType.Auto,), devices=jax.devices()[:count])
 
 
 @contextmanager
 def shared_by(mesh: Mesh | None) -> Iterator[None]:
-    """What is traced inside is shared by the devices of a mesh."""
+    """Share what is traced inside between the devices of a mesh."""
     before = _MESH.set(mesh)
     try:
         yield
@@ -56,32 +55,38 @@ def shared_by(mesh: Mesh | None) -> Iterator[None]:
 
 
 def count() -> int:
-    """Devices that share what is being traced."""
+    """Return the number of devices that share what is being traced."""
     mesh = _MESH.get()
     return 1 if mesh is None else mesh.size
 
 
-def divided(f: Callable, take: tuple[int | None, ...], give: Any) -> Callable:
-    """`f` on each device's share: argument i is divided along axis `take[i]`, or whole where that is None; results along `give`."""
+def divided(f: Callable, in_axes: tuple[int | None, ...], out_axes: Any) -> Callable:
+    """Run `f` on each device's share of its arguments.
+
+    Args:
+        f: the function.
+        in_axes: the axis along which each argument is divided; None for a whole argument.
+        out_axes: the same for the results, a tree prefix.
+    """
     mesh = _MESH.get()
     if mesh is None:
         return f
 
-    def alone(*args: Any) -> Any:
+    def on_one_device(*args: Any) -> Any:
         with shared_by(None):
             return f(*args)
 
     return jax.shard_map(
-        alone,
+        on_one_device,
         mesh=mesh,
-        in_specs=tuple(map(_spec, take)),
-        out_specs=jax.tree.map(_spec, give, is_leaf=lambda x: x is None),
+        in_specs=tuple(map(_spec, in_axes)),
+        out_specs=jax.tree.map(_spec, out_axes, is_leaf=lambda x: x is None),
         check_vma=False,
     )
 
 
 def divide(tree: Any, axis: int = 0) -> Any:
-    """The tree with every array divided along an axis, where that comes out even."""
+    """Divide every array of a tree along an axis, where that comes out even."""
     mesh = _MESH.get()
     if mesh is None:
         return tree
@@ -89,32 +94,37 @@ def divide(tree: Any, axis: int = 0) -> Any:
 
 
 def gather(tree: Any) -> Any:
-    """The tree whole on every device."""
+    """Return the tree whole on every device."""
     mesh = _MESH.get()
     return tree if mesh is None else jax.tree.map(lambda x: _put(x, mesh, None), tree)
 
 
-def side_by_side(*tasks: tuple[Callable, tuple]) -> tuple[Any, ...]:
-    """The results of independent functions, each with its arguments: each on a CPU device of its own, or all on all accelerators."""
+def concurrently(*tasks: tuple[Callable, tuple]) -> tuple[Any, ...]:
+    """Call independent functions: each on a CPU device of its own, or all on all accelerators.
+
+    Args:
+        tasks: functions and their arguments.
+
+    Returns:
+        Their results.
+    """
     mesh = _MESH.get()
-    if mesh is None or not _apart(mesh):
+    if mesh is None or mesh.devices.flat[0].platform != "cpu":
         return tuple(f(*args) for f, args in tasks)
     functions, arguments = zip(*tasks, strict=True)
     shapes = [jax.eval_shape(f, *args) for f, args in tasks]
 
     def only(mine: int, arguments: tuple) -> tuple[Any, ...]:
-        nothing = [jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shape) for shape in shapes]
-        return tuple(f(*args) if i == mine else nothing[i] for i, (f, args) in enumerate(zip(functions, arguments, strict=True)))
+        zeros = [jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shape) for shape in shapes]
+        calls = enumerate(zip(functions, arguments, strict=True))
+        return tuple(f(*args) if i == mine else zeros[i] for i, (f, args) in calls)
 
-    def share(arguments: tuple) -> tuple[Any, ...]:
-        branches = [partial(only, i) for i in range(len(functions) + 1)]  # the last has nothing to do
-        return jax.lax.psum(jax.lax.switch(jnp.minimum(jax.lax.axis_index(AXIS), len(functions)), branches, arguments), AXIS)
+    def per_device(arguments: tuple) -> tuple[Any, ...]:
+        branches = [partial(only, i) for i in range(len(functions) + 1)]  # the last one is idle
+        branch = jnp.minimum(jax.lax.axis_index(AXIS), len(functions))
+        return jax.lax.psum(jax.lax.switch(branch, branches, arguments), AXIS)
 
-    return divided(share, (None,), None)(arguments)
-
-
-def _apart(mesh: Mesh) -> bool:
-    return mesh.devices.flat[0].platform == "cpu"
+    return divided(per_device, (None,), None)(arguments)
 
 
 def _spec(axis: int | None) -> PartitionSpec:

@@ -1,7 +1,7 @@
-"""Networks for policies and value distributions: hidden layers, the torso, below a head.
+"""Networks for policies and value distributions: a torso of hidden layers and a head.
 
-Orthogonal weights, zero biases, tanh between layers; the policy's last layer starts near zero, so that the first
-actions are noise around zero (Andrychowicz et al. 2021).
+Orthogonal weights, zero biases, tanh between layers; the policy's last layer starts near zero, so
+that the first actions are noise around zero (Andrychowicz et al. 2021).
 """
 
 from collections.abc import Callable, Sequence
@@ -11,23 +11,27 @@ import flax.linen as nn
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
-from dgae_jax.learn.types import Policy
+from dgae_jax.learn.types import Init, Policy, Predict
 from dgae_jax.maths.gaussian import Gaussian
 
 
 class Network(NamedTuple):
-    """`init(key) -> params`; `apply(params, obs [..., O]) -> [..., outputs]`."""
+    """A value network; `predict` of a critic adds its head."""
 
-    init: Callable
-    apply: Callable
+    init: Init
+    apply: Predict
 
 
 def _dense(width: int, scale: float, bias: ArrayLike = 0.0) -> nn.Dense:
-    return nn.Dense(width, kernel_init=nn.initializers.orthogonal(scale), bias_init=nn.initializers.constant(bias))
+    return nn.Dense(
+        width,
+        kernel_init=nn.initializers.orthogonal(scale),
+        bias_init=nn.initializers.constant(bias),
+    )
 
 
 class Torso(nn.Module):
-    """Hidden tanh layers; any other flax module of `hidden` may take its place in the modules below."""
+    """Hidden tanh layers; the modules below take any other flax module of `hidden` in its place."""
 
     hidden: Sequence[int]
 
@@ -62,12 +66,14 @@ class SharedCovariance(nn.Module):
     @nn.compact
     def __call__(self, obs: Float[Array, "*batch O"]) -> Gaussian:
         mean = _dense(self.actions, 0.01)(self.torso(self.hidden)(obs))
-        log_std = self.param("log_std", nn.initializers.constant(jnp.log(self.initial_std)), (self.actions,))
+        log_std = self.param(
+            "log_std", nn.initializers.constant(jnp.log(self.initial_std)), (self.actions,)
+        )
         return Gaussian(mean, jnp.broadcast_to(log_std, mean.shape))
 
 
 class StateCovariance(nn.Module):
-    """Mean and log σ both from the observation; σ is clipped to e⁻⁵ … e², far from overflow in σ⁻²."""
+    """Mean and log σ from the observation; σ is clipped to e⁻⁵ … e², far from overflow in σ⁻²."""
 
     hidden: Sequence[int]
     actions: int
@@ -82,19 +88,55 @@ class StateCovariance(nn.Module):
         return Gaussian(mean, jnp.clip(log_std, -5.0, 2.0))
 
 
+COVARIANCES: dict[str, Callable[..., nn.Module]] = {
+    "shared": SharedCovariance,
+    "state": StateCovariance,
+}
+
+
 def gaussian_policy(
-    obs_size: int, action_size: int, *, hidden: Sequence[int], covariance: Callable[..., nn.Module], initial_std: ArrayLike
+    obs_size: int,
+    action_size: int,
+    *,
+    hidden: Sequence[int],
+    covariance: Callable[..., nn.Module],
+    initial_std: ArrayLike,
 ) -> Policy:
-    """A Gaussian policy with mean and diagonal covariance (Sec. results, set-up); `covariance` is one of the two modules above,
-    or another of `hidden`, `actions` and `initial_std` that returns a Gaussian.
+    """Build a Gaussian policy with diagonal covariance (Sec. results, set-up).
+
+    Args:
+        obs_size: length of an observation.
+        action_size: length of an action.
+        hidden: widths of the hidden layers.
+        covariance: a module of `hidden`, `actions` and `initial_std` that returns a Gaussian.
+        initial_std: standard deviation of the first actions.
     """
     module = covariance(tuple(hidden), action_size, initial_std)
-    return Policy(lambda key: module.init(key, jnp.zeros(obs_size)), module.apply)
+    return Policy(
+        lambda key: module.init(key, jnp.zeros(obs_size)),
+        lambda params, obs: module.apply(params, obs),  # pyright: ignore[reportArgumentType]
+    )
 
 
 def value_network(
-    obs_size: int, outputs: int, *, hidden: Sequence[int], torso: Callable[[Sequence[int]], nn.Module] = Torso, bias: ArrayLike = 0.0
+    obs_size: int,
+    outputs: int,
+    *,
+    hidden: Sequence[int],
+    torso: Callable[[Sequence[int]], nn.Module] = Torso,
+    bias: ArrayLike = 0.0,
 ) -> Network:
-    """A head of `outputs` numbers, one scalar or K quantiles (Sec. results, set-up), whose biases begin at `bias`."""
+    """Build a network with one scalar or K quantiles as outputs (Sec. results, set-up).
+
+    Args:
+        obs_size: length of an observation.
+        outputs: number of outputs.
+        hidden: widths of the hidden layers.
+        torso: flax module of the `hidden` layers.
+        bias: initial biases of the head.
+    """
     module = Value(tuple(hidden), outputs, torso, bias)
-    return Network(lambda key: module.init(key, jnp.zeros(obs_size)), module.apply)
+    return Network(
+        lambda key: module.init(key, jnp.zeros(obs_size)),
+        lambda params, obs: module.apply(params, obs),  # pyright: ignore[reportArgumentType]
+    )

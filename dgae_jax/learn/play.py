@@ -1,4 +1,4 @@
-"""Episodes that are only watched: independent worlds side by side, until each one's first end."""
+"""Episodes that are only watched: independent envs, each until its first end."""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -11,23 +11,32 @@ from dgae_jax.envs.base import Env
 
 
 class Play(NamedTuple):
-    """Where E episodes are."""
+    """The progress of E episodes."""
 
     env: Any
     total: Float[Array, " E"]
-    """Undiscounted return so far, of an episode that is over its return."""
+    """Undiscounted return so far; final where the episode has ended."""
     alive: Bool[Array, " E"]
-    """False where the episode is over."""
+    """False where the episode has ended."""
     step: Int[Array, ""]
 
 
 def begin(state: Any) -> Play:
-    """The episodes that begin in these worlds, environment states with a leading axis."""
-    return Play(state, jnp.zeros_like(state.reward), jnp.full(state.reward.shape, True), jnp.int32(0))
+    """Return the episodes that begin in these env states, which have a leading axis."""
+    return Play(
+        state, jnp.zeros_like(state.reward), jnp.full(state.reward.shape, True), jnp.int32(0)
+    )
 
 
 def play(env: Env, act: Callable[[Array], Array], episodes: Play, until: ArrayLike) -> Play:
-    """Go on to step number `until`, or to where all are over, with `act(obs [E, O]) -> action [E, A]`."""
+    """Continue to step number `until`, or until all episodes have ended.
+
+    Args:
+        env: the task.
+        act: `act(obs [E, O]) -> action [E, A]`, clipped to the actuators' range.
+        episodes: where they are.
+        until: the step to stop at.
+    """
     low, high = env.action_range
 
     def unfinished(episodes: Play):

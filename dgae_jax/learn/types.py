@@ -1,15 +1,19 @@
-"""The records that flow through the trainer: data, networks in training, and the parts of an algorithm.
+"""The records that flow through the trainer: data, networks in training, and parts of an algorithm.
 
-Leading axes: T time steps of a rollout, N parallel worlds, B = T·N flattened samples, K quantiles, A actions.
+Leading axes: T time steps of a rollout, N parallel envs, B = T·N flattened samples, K quantiles,
+A action dimensions.
 """
 
-from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 from jaxtyping import Array, Bool, Float, Int, Key
 
+from dgae_jax.maths.gaussian import Gaussian
+
 Params = Any
 """A pytree of network parameters."""
+Metrics = dict[str, Array]
+"""Scalars worth logging, by name."""
 
 
 class Transition(NamedTuple):
@@ -22,12 +26,12 @@ class Transition(NamedTuple):
     terminated: Bool[Array, "T N"]
     truncated: Bool[Array, "T N"]
     next_obs: Float[Array, "T N O"]
-    valid: Bool[Array, "T N"]
-    """False where the world turned non-finite: that step weighs nothing in any loss, standardisation or running scale."""
+    mask: Bool[Array, "T N"]
+    """False where the env turned non-finite: the step has no weight in any loss or statistic."""
 
 
 class Batch(NamedTuple):
-    """The samples that the updates learn from; observations are normalised, rewards scaled.
+    """The samples of an iteration; observations are normalized, rewards scaled.
 
     `reward`, `discount` and `next_obs` serve targets that are recomputed with the current critic.
     """
@@ -37,82 +41,146 @@ class Batch(NamedTuple):
     log_prob: Float[Array, " B"]
     advantage: Float[Array, " B"]
     value: Float[Array, " B"]
-    """The mean that the critic predicted which acted."""
+    """Value estimate at rollout time."""
     target: Float[Array, "B J"]
     reward: Float[Array, " B"]
     discount: Float[Array, " B"]
     next_obs: Float[Array, "B O"]
-    valid: Bool[Array, " B"]
-    """Where False, the sample weighs nothing in any loss."""
+    mask: Bool[Array, " B"]
+    """False where the sample has no weight in any loss."""
 
 
-class Fit(NamedTuple):
-    """One network in training."""
+class TrainableState(NamedTuple):
+    """A network in training."""
 
     params: Params
     opt_state: Any
 
 
-class Fitted(NamedTuple):
-    """A network as it is used: all that is needed to act, or to predict."""
+class InferenceState(NamedTuple):
+    """A network in use: all that acting or predicting needs."""
 
     params: Params
-    observations: Any
-    """Running mean and standard deviation by which observations are normalised; None if they are used as they are."""
+    obs_stats: Any
+    """Running mean and standard deviation of observations; None if they are not normalized."""
 
 
 class TrainState(NamedTuple):
-    """Everything an iteration reads and writes; the whole of a run."""
+    """Everything that an iteration reads and writes; the whole of a run."""
 
-    policy: Fit
-    critic: Fit
-    observations: Any
-    """Running mean and standard deviation of observations; None if they are not normalised."""
+    policy: TrainableState
+    critic: TrainableState
+    obs_stats: Any
+    """Running mean and standard deviation of observations; None if they are not normalized."""
     reward_scale: Any
     """Running standard deviation of discounted returns, by which rewards are divided."""
     episodes: Any
-    """The worlds and the bookkeeping of their episodes."""
+    """The envs and the bookkeeping of their episodes."""
     key: Key[Array, ""]
     iteration: Int[Array, ""]
     failures: Int[Array, ""]
-    """Iterations in a row in which an update was not finite and was left out, or more than half of the world steps were invalid."""
+    """Iterations in a row in which a non-finite update was skipped or most env steps were masked."""
+
+
+class Init(Protocol):
+    """Initial parameters of a network."""
+
+    def __call__(self, key: Key[Array, ""]) -> Params: ...
+
+
+class ApplyPolicy(Protocol):
+    """Distribution over actions [..., A] in observations [..., O]."""
+
+    def __call__(self, params: Params, obs: Float[Array, "*batch O"]) -> Gaussian: ...
+
+
+class Predict(Protocol):
+    """Quantiles [..., K] of the return from observations [..., O]; K = 1 for a scalar critic."""
+
+    def __call__(
+        self, params: Params, obs: Float[Array, "*batch O"]
+    ) -> Float[Array, "*batch K"]: ...
+
+
+class TargetFn(Protocol):
+    """Targets [T, N, J] of a critic's fit, from predictions of the critic at rollout time.
+
+    `trace` is λ(1 − done) and `discount` γ(1 − terminated); one signature for all targets.
+    """
+
+    def __call__(
+        self,
+        key: Key[Array, ""] | None,
+        reward: Float[Array, "T *N"],
+        discount: Float[Array, "T *N"],
+        trace: Float[Array, "T *N"] | None,
+        quantiles: Float[Array, "T *N K"] | None,
+        next_quantiles: Float[Array, "T *N K"],
+    ) -> Float[Array, "T *N J"]: ...
+
+
+class Loss(Protocol):
+    """Mean loss of a batch, and scalars worth logging."""
+
+    def __call__(self, params: Params, batch: Any) -> tuple[Float[Array, ""], Metrics]: ...
+
+
+class Residual(Protocol):
+    """TD error δ [T, N] from the predictions before and after a step: the part that DGAE changes."""
+
+    def __call__(
+        self,
+        reward: Float[Array, "T N"],
+        discount: Float[Array, "T N"],
+        quantiles: Float[Array, "T N K"],
+        next_quantiles: Float[Array, "T N K"],
+    ) -> Float[Array, "T N"]: ...
+
+
+class InitOptimizer(Protocol):
+    """State of an optimizer at the start."""
+
+    def __call__(self, params: Params) -> Any: ...
+
+
+class UpdateStep(Protocol):
+    """One iteration's update of a network, and scalars worth logging."""
+
+    def __call__(
+        self, key: Key[Array, ""], state: TrainableState, batch: Any
+    ) -> tuple[TrainableState, Metrics]: ...
 
 
 class Policy(NamedTuple):
-    """`init(key) -> params`; `apply(params, obs [..., O]) -> Gaussian` over actions [..., A]."""
+    """A policy network."""
 
-    init: Callable
-    apply: Callable
+    init: Init
+    apply: ApplyPolicy
 
 
 class Critic(NamedTuple):
-    """A value distribution: its prediction, the target it is fitted to, and the loss between the two."""
+    """A value distribution: its prediction, the target it is fitted to, and the loss between them."""
 
-    init: Callable
-    """`init(key) -> params`."""
-    predict: Callable
-    """`predict(params, obs [..., O]) -> quantiles [..., K]`."""
-    target: Callable
-    """`target(key, reward, discount, trace, quantiles, next_quantiles) -> [T, N, J]`, of the critic that acted."""
-    loss: Callable
-    """`loss(params, batch) -> (scalar, info)`."""
+    init: Init
+    predict: Predict
+    target: TargetFn
+    loss: Loss
     lam: float | None = None
-    """λ of the target's trace where it is not that of the advantages."""
+    """λ of the target's trace where it differs from that of the advantages."""
 
 
 class Update(NamedTuple):
-    """`init(params) -> opt_state`; `step(key, fit, batch) -> (fit, info)`."""
+    """How a network is updated."""
 
-    init: Callable
-    step: Callable
+    init: InitOptimizer
+    step: UpdateStep
 
 
 class Algorithm(NamedTuple):
-    """A policy-gradient algorithm is this record; the six names of the paper are rows of one table."""
+    """A policy-gradient algorithm; the six names of the paper are rows of `configs.algorithms`."""
 
     policy: Policy
     critic: Critic
-    residual: Callable
-    """`residual(reward, discount, quantiles, next_quantiles) -> δ`, the one thing DGAE changes."""
+    residual: Residual
     policy_update: Update
     critic_update: Update

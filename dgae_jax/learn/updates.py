@@ -1,4 +1,4 @@
-"""Updates of parameters: the surrogate objective, stochastic gradient steps on any loss, and the trust region."""
+"""Updates of parameters: the surrogate objective, minibatch gradient descent, the trust region."""
 
 from collections.abc import Callable
 from typing import Any
@@ -9,126 +9,156 @@ import optax
 from jaxtyping import Array, ArrayLike
 
 from dgae_jax.learn import devices
-from dgae_jax.learn.types import Batch, Fit, Params, Policy, Update
+from dgae_jax.learn.types import Batch, Loss, Params, Policy, TrainableState, Update
 from dgae_jax.maths import gaussian
 
-Loss = Callable[[Params, Any], tuple[jax.Array, dict[str, jax.Array]]]
-"""`loss(params, batch) -> (scalar, info)`; info holds scalars worth logging."""
-
+Optimizer = Callable[[Any], optax.GradientTransformation]
+"""`optimizer(learning rate or schedule)`."""
 
 LOG_RATIO_LIMIT = 20.0
-"""Largest |log ρ|: beyond a ratio of e²⁰ ≈ 5·10⁸, or its inverse, a sample counts as one at the limit and has no gradient.
+"""Largest |log ρ|: a sample beyond it counts as one at the limit and has no gradient. PPO's clip
+and TRPO's KL bound act at ratios near 1; float32 overflows at log ρ = 88.7."""
 
-PPO's clip and TRPO's radius act at ratios near 1, so nothing changes there; float32 overflows at log ρ = 88.7.
-"""
-
-STEADY = 0.8
-"""Share of a run after which the radius of a trust region falls, if it does: one that falls from the start learns less on Walker2d, and
-what it is to prevent, that the last step is one too far, is a matter of the end (docs/decisions.md)."""
+RADIUS_DECAY_START = 0.8
+"""Share of a run after which max_kl decays: a decay from the start learns less on Walker2d."""
 
 
-def surrogate(policy: Policy, clip: ArrayLike = jnp.inf) -> Loss:
-    """−E[min(ρA, clip(ρ, 1 ± ε)A)], ρ = π(a|s)/π_old(a|s) (Schulman et al. 2017); without a clip, plain ρA.
+def surrogate(policy: Policy, clip_eps: ArrayLike = jnp.inf) -> Loss:
+    """Return the clipped surrogate loss −E[min(ρA, clip(ρ, 1 ± ε)A)] (Schulman et al. 2017).
 
-    At the policy that acted its gradient is that of −E[A log π] (Eq. gradient_obj_fcn). ρ is bounded by `LOG_RATIO_LIMIT`.
+    ρ = π(a|s)/π_old(a|s), bounded by `LOG_RATIO_LIMIT`. At the policy that acted the gradient is
+    that of −E[A log π] (Eq. gradient_obj_fcn).
+
+    Args:
+        policy: the policy network.
+        clip_eps: clip range ε; infinite for the plain surrogate ρA.
     """
 
     def loss(params: Params, batch: Batch):
         distribution = policy.apply(params, batch.obs)
-        log_ratio = jnp.where(batch.valid, gaussian.log_prob(distribution, batch.action) - batch.log_prob, 0)
+        log_prob = gaussian.log_prob(distribution, batch.action)
+        log_ratio = jnp.where(batch.mask, log_prob - batch.log_prob, 0)
         log_ratio = jnp.clip(log_ratio, -LOG_RATIO_LIMIT, LOG_RATIO_LIMIT)
         ratio = jnp.exp(log_ratio)
-        clipped = jnp.clip(ratio, jnp.subtract(1, clip), jnp.add(1, clip))
+        clipped = jnp.clip(ratio, jnp.subtract(1, clip_eps), jnp.add(1, clip_eps))
         gain = jnp.minimum(ratio * batch.advantage, clipped * batch.advantage)
         info = {
             "kl": (ratio - 1 - log_ratio).mean(),
             "entropy": gaussian.entropy(distribution).mean(),
-            "clip_fraction": (jnp.abs(ratio - 1) > clip).mean(),
+            "clip_fraction": (jnp.abs(ratio - 1) > clip_eps).mean(),
         }
         return -gain.mean(), info
 
     return loss
 
 
-def sgd(loss: Loss, optimizer: optax.GradientTransformation, *, epochs: int, minibatches: int) -> Update:
-    """`epochs` passes over the shuffled batch, any record of arrays [B, …] with `obs`, in `minibatches` optimizer steps each.
+def sgd(
+    loss: Loss, optimizer: optax.GradientTransformation, *, epochs: int, minibatches: int
+) -> Update:
+    """Return `epochs` passes over the shuffled batch, `minibatches` optimizer steps each.
 
-    A2C, PPO's policy step and every critic fit are this. The info holds the means over all steps.
+    A batch is any record of arrays [B, …] with `obs`. The info holds means over all steps.
     """
 
-    def minibatch(fit: Fit, batch: Any):
-        (value, info), gradient = jax.value_and_grad(loss, has_aux=True)(fit.params, batch)
-        updates, opt_state = optimizer.update(gradient, fit.opt_state, fit.params)
+    def minibatch_step(state: TrainableState, batch: Any):
+        (value, info), gradient = jax.value_and_grad(loss, has_aux=True)(state.params, batch)
+        updates, opt_state = optimizer.update(gradient, state.opt_state, state.params)
         info = {"loss": value, "gradient_norm": optax.global_norm(gradient), **info}
-        return Fit(optax.apply_updates(fit.params, updates), opt_state), info
+        return TrainableState(optax.apply_updates(state.params, updates), opt_state), info
 
-    def step(key: jax.Array, fit: Fit, batch: Any):
+    def step(key: jax.Array, state: TrainableState, batch: Any):
         size = batch.obs.shape[0]
         if size % minibatches:
-            raise ValueError(f"a batch of {size} samples does not divide into {minibatches} minibatches")
+            raise ValueError(f"{size} samples do not divide into {minibatches} minibatches")
 
-        def epoch(fit: Fit, key: jax.Array):
-            order = devices.divide(jax.random.permutation(key, size).reshape(minibatches, -1), axis=1)
-            return jax.lax.scan(lambda fit, rows: minibatch(fit, jax.tree.map(lambda x: x[rows], batch)), fit, order)
+        def epoch(state: TrainableState, key: jax.Array):
+            order = jax.random.permutation(key, size).reshape(minibatches, -1)
+            order = devices.divide(order, axis=1)
+            return jax.lax.scan(
+                lambda state, rows: minibatch_step(state, jax.tree.map(lambda x: x[rows], batch)),
+                state,
+                order,
+            )
 
-        fit, infos = jax.lax.scan(epoch, fit, jax.random.split(key, epochs))
-        return fit, jax.tree.map(jnp.mean, infos)
+        state, infos = jax.lax.scan(epoch, state, jax.random.split(key, epochs))
+        return state, jax.tree.map(jnp.mean, infos)
 
     return Update(optimizer.init, step)
 
 
 def trust_region(
-    policy: Policy, loss: Loss, *, radius: optax.Schedule, damping: ArrayLike, cg_iterations: int, backtracks: int, fisher_every: int
+    policy: Policy,
+    loss: Loss,
+    *,
+    max_kl: optax.Schedule,
+    damping: ArrayLike,
+    cg_iterations: int,
+    max_backtracks: int,
+    fisher_every: int,
 ) -> Update:
-    """The natural gradient step to a KL radius, halved until KL and loss accept it (TRPO, Schulman et al. 2015).
+    """Return the natural gradient step of TRPO with a backtracking line search.
 
-    The direction solves (F + damping) x = −∇loss by `cg_iterations` of conjugate gradient, with the Fisher matrix F of every
-    `fisher_every`-th sample. A step is taken only if KL(old ‖ new) ≤ `radius` of the number of steps before and the loss falls; if
-    none of 1 + `backtracks` lengths is such a step, the parameters stay as they are, bit for bit. As in the paper of TRPO the
-    divergence is that of the whole action, summed over its A dimensions; where it is averaged over them (sb3-contrib), radius and
-    damping are ours over A.
+    The direction solves (F + damping) x = −∇loss (Schulman et al. 2015). A step is accepted only if
+    KL(old ‖ new) ≤ `max_kl` and the loss falls; otherwise the parameters stay, bit for bit. As in
+    the paper of TRPO the divergence is summed over the A action dimensions; where it is averaged
+    (sb3-contrib), max_kl and damping are ours over A.
+
+    Args:
+        policy: the policy network.
+        loss: the surrogate.
+        max_kl: KL bound [nats] by the number of steps before.
+        damping: multiple of the identity added to the Fisher matrix F.
+        cg_iterations: iterations of conjugate gradient.
+        max_backtracks: times a step is halved before it is given up.
+        fisher_every: F is estimated from every n-th sample.
     """
 
-    def step(key: jax.Array, fit: Fit, batch: Batch):
-        old, batch, within = fit.params, devices.divide(batch), radius(fit.opt_state)
+    def step(key: jax.Array, state: TrainableState, batch: Batch):
+        old, batch, bound = state.params, devices.divide(batch), max_kl(state.opt_state)
         (start, info), gradient = jax.value_and_grad(loss, has_aux=True)(old, batch)
         fisher = fisher_product(policy, old, batch.obs[::fisher_every], damping)
-        direction, _ = jax.scipy.sparse.linalg.cg(fisher, jax.tree.map(jnp.negative, gradient), maxiter=cg_iterations, tol=1e-10)
+        descent = jax.tree.map(jnp.negative, gradient)
+        direction, _ = jax.scipy.sparse.linalg.cg(fisher, descent, maxiter=cg_iterations, tol=1e-10)
         curvature = optax.tree.vdot(direction, fisher(direction))
-        longest = jnp.sqrt(2 * within / curvature)
+        max_step_size = jnp.sqrt(2 * bound / curvature)
 
         def attempt(halvings):
-            new = jax.tree.map(lambda p, d: p + longest * 0.5**halvings * d, old, direction)
-            moved = gaussian.kl(policy.apply(old, batch.obs), policy.apply(new, batch.obs)).mean()
+            new = jax.tree.map(lambda p, d: p + max_step_size * 0.5**halvings * d, old, direction)
+            kl = gaussian.kl(policy.apply(old, batch.obs), policy.apply(new, batch.obs)).mean()
             value, info = loss(new, batch)
-            return new, value, moved, (moved <= within) & (value < start), info["entropy"]
+            return new, value, kl, (kl <= bound) & (value < start), info["entropy"]
 
-        def search(carry):
+        def backtrack(carry):
             halvings, _ = carry
             return halvings + 1, attempt(halvings + 1)
 
-        def unfinished(carry):
+        def rejected(carry):
             halvings, (*_, accepted, _) = carry
-            return ~accepted & (halvings < backtracks)
+            return ~accepted & (halvings < max_backtracks)
 
-        halvings, (new, value, moved, accepted, entropy) = jax.lax.while_loop(unfinished, search, (jnp.int32(0), attempt(jnp.int32(0))))
+        first = jnp.int32(0), attempt(jnp.int32(0))
+        halvings, (new, value, kl, accepted, entropy) = jax.lax.while_loop(
+            rejected, backtrack, first
+        )
         params = jax.tree.map(lambda n, o: jnp.where(accepted, n, o), new, old)
         info = {
             "loss": start,
             "gradient_norm": optax.global_norm(gradient),
-            "kl": jnp.where(accepted, moved, 0),
+            "kl": jnp.where(accepted, kl, 0),
             "entropy": jnp.where(accepted, entropy, info["entropy"]),
             "improvement": jnp.where(accepted, start - value, 0),
             "accepted": accepted.astype(start.dtype),
             "halvings": halvings.astype(start.dtype),
         }
-        return Fit(params, fit.opt_state + 1), info
+        return TrainableState(params, state.opt_state + 1), info
 
     return Update(lambda params: jnp.int32(0), step)
 
 
-def fisher_product(policy: Policy, params: Params, obs: Array, damping: ArrayLike) -> Callable[[Params], Params]:
-    """v ↦ (F + damping) v, F the Hessian of the mean KL from `params` at `params`, without forming it."""
+def fisher_product(
+    policy: Policy, params: Params, obs: Array, damping: ArrayLike
+) -> Callable[[Params], Params]:
+    """Return v ↦ (F + damping) v, F the Hessian of the mean KL at `params`, never formed."""
     here = policy.apply(params, obs)
 
     def slope(params: Params) -> Params:
@@ -150,43 +180,90 @@ def rmsprop(rate) -> optax.GradientTransformation:
     return optax.rmsprop(rate, decay=0.99, eps=1e-5, eps_in_sqrt=False)
 
 
-def falling(start: ArrayLike, final_fraction: ArrayLike, steps: ArrayLike, after: float = 0.0) -> optax.Schedule:
-    """From `start` linearly to `final_fraction` of it over so many steps, of which the share `after` is constant; constant then.
+OPTIMIZERS: dict[str, Optimizer] = {"adam": adam, "rmsprop": rmsprop}
 
-    The first three may be traced.
+
+def linear_schedule(
+    start: ArrayLike, end_fraction: ArrayLike, steps: ArrayLike, decay_start: float = 0.0
+) -> optax.Schedule:
+    """Return a schedule from `start` linearly to `end_fraction` of it, constant afterwards.
+
+    Args:
+        start: value at the start; may be traced, as the next two.
+        end_fraction: value at the end over that at the start.
+        steps: length of the schedule.
+        decay_start: share of the steps before the decay begins.
     """
 
     def schedule(count: ArrayLike) -> Array:
-        done = jnp.clip((jnp.divide(count, steps) - after) / (1 - after), 0.0, 1.0)
-        return jnp.multiply(start, 1 + (final_fraction - 1) * done)
+        done = jnp.clip((jnp.divide(count, steps) - decay_start) / (1 - decay_start), 0.0, 1.0)
+        return jnp.multiply(start, 1 + (end_fraction - 1) * done)
 
     return schedule
 
 
-def descent(optimizer: Callable, learning_rate, *, final_fraction, gradient_steps, max_norm) -> optax.GradientTransformation:
-    """An optimizer behind a global-norm clip, its rate `falling` over `gradient_steps`."""
-    return optax.chain(optax.clip_by_global_norm(max_norm), optimizer(falling(learning_rate, final_fraction, gradient_steps)))
+def make_optimizer(
+    optimizer: Optimizer, learning_rate: ArrayLike, *, end_fraction, gradient_steps, max_grad_norm
+) -> optax.GradientTransformation:
+    """Return an optimizer behind a global-norm clip, on a linear schedule over the run."""
+    schedule = linear_schedule(learning_rate, end_fraction, gradient_steps)
+    return optax.chain(optax.clip_by_global_norm(max_grad_norm), optimizer(schedule))
 
 
-def descend(
-    loss: Loss, iterations: ArrayLike, *, optimizer, learning_rate, learning_rate_end, epochs: int, minibatches: int, max_grad_norm
+def minibatch_update(
+    loss: Loss,
+    iterations: ArrayLike,
+    *,
+    optimizer: str,
+    learning_rate: ArrayLike,
+    learning_rate_end: ArrayLike,
+    epochs: int,
+    minibatches: int,
+    max_grad_norm: ArrayLike,
 ) -> Update:
-    """`sgd` on a loss, with a learning rate that falls over a run of `iterations`."""
-    steps = iterations * epochs * minibatches
-    rule = descent(optimizer, learning_rate, final_fraction=learning_rate_end, gradient_steps=steps, max_norm=max_grad_norm)
+    """Return `sgd` on a loss, with a learning rate that decays over a run of `iterations`.
+
+    Args:
+        loss: the loss of a minibatch.
+        iterations: iterations of the run.
+        optimizer: a name in `OPTIMIZERS`.
+        learning_rate: learning rate at the start.
+        learning_rate_end: learning rate at the end over that at the start.
+        epochs: passes over each batch.
+        minibatches: gradient steps per pass.
+        max_grad_norm: largest global norm of a gradient.
+    """
+    rule = make_optimizer(
+        OPTIMIZERS[optimizer],
+        learning_rate,
+        end_fraction=learning_rate_end,
+        gradient_steps=iterations * epochs * minibatches,
+        max_grad_norm=max_grad_norm,
+    )
     return sgd(loss, rule, epochs=epochs, minibatches=minibatches)
 
 
-def clipped(policy: Policy, iterations: ArrayLike, *, clip: ArrayLike, **fit) -> Update:
-    """PPO: descent on the clipped surrogate."""
-    return descend(surrogate(policy, clip), iterations, **fit)
+def ppo_update(policy: Policy, iterations: ArrayLike, *, clip_eps: ArrayLike, **fit) -> Update:
+    """PPO: minibatch gradient descent on the clipped surrogate."""
+    return minibatch_update(surrogate(policy, clip_eps), iterations, **fit)
 
 
-def policy_gradient(policy: Policy, iterations: ArrayLike, **fit) -> Update:
-    """A2C: descent on the surrogate without a clip."""
-    return descend(surrogate(policy), iterations, **fit)
+def a2c_update(policy: Policy, iterations: ArrayLike, **fit) -> Update:
+    """A2C: minibatch gradient descent on the surrogate without a clip."""
+    return minibatch_update(surrogate(policy), iterations, **fit)
 
 
-def natural_gradient(policy: Policy, iterations: ArrayLike, *, radius: ArrayLike, learning_rate_end: ArrayLike, **search) -> Update:
-    """TRPO: a natural gradient step on the surrogate within a trust region, whose radius falls at the end of a run of `iterations`."""
-    return trust_region(policy, surrogate(policy), radius=falling(radius, learning_rate_end, iterations, STEADY), **search)
+def trpo_update(
+    policy: Policy, iterations: ArrayLike, *, max_kl: ArrayLike, learning_rate_end, **search
+) -> Update:
+    """TRPO: a natural gradient step on the surrogate, whose max_kl decays at the end of the run."""
+    schedule = linear_schedule(max_kl, learning_rate_end, iterations, RADIUS_DECAY_START)
+    return trust_region(policy, surrogate(policy), max_kl=schedule, **search)
+
+
+UPDATES: dict[str, Callable[..., Update]] = {
+    "clip": ppo_update,
+    "gradient": a2c_update,
+    "trust-region": trpo_update,
+}
+"""`update(policy, iterations, **options)`."""

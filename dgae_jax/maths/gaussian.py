@@ -24,7 +24,9 @@ def sample(key: Key[Array, ""], distribution: Gaussian) -> Float[Array, "*batch 
 def log_prob(distribution: Gaussian, action: Float[Array, "*batch A"]) -> Float[Array, "*batch"]:
     """log π(a) = −Σ [½((a − mean)/σ)² + log σ + ½ log 2π]."""
     mean, log_std = distribution
-    return -(0.5 * ((action - mean) * jnp.exp(-log_std)) ** 2 + log_std + 0.5 * math.log(2 * math.pi)).sum(-1)
+    return -(
+        0.5 * ((action - mean) * jnp.exp(-log_std)) ** 2 + log_std + 0.5 * math.log(2 * math.pi)
+    ).sum(-1)
 
 
 def entropy(distribution: Gaussian) -> Float[Array, "*batch"]:

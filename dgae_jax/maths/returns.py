@@ -26,10 +26,15 @@ class Decay(NamedTuple):
 def decay(terminated: Mask, truncated: Mask, *, gamma: ArrayLike, lam: ArrayLike) -> Decay:
     """The two masks as the two factors every estimator below is written in."""
     done = jnp.logical_or(terminated, truncated)
-    return Decay(jnp.multiply(gamma, 1.0 - jnp.asarray(terminated, float)), jnp.multiply(lam, 1.0 - jnp.asarray(done, float)))
+    return Decay(
+        jnp.multiply(gamma, 1.0 - jnp.asarray(terminated, float)),
+        jnp.multiply(lam, 1.0 - jnp.asarray(done, float)),
+    )
 
 
-def lambda_sum(delta: Float[Array, "T *batch"], factor: Float[Array, "T *batch"]) -> Float[Array, "T *batch"]:
+def lambda_sum(
+    delta: Float[Array, "T *batch"], factor: Float[Array, "T *batch"]
+) -> Float[Array, "T *batch"]:
     """Aₜ = δₜ + factorₜ Aₜ₊₁, A_T = 0, so Aₜ = Σₖ (γλ)ᵏ δₜ₊ₖ within an episode (Theorem, Eq. gae_final)."""
 
     def back(advantage, step):
@@ -41,7 +46,10 @@ def lambda_sum(delta: Float[Array, "T *batch"], factor: Float[Array, "T *batch"]
 
 
 def td_residual(
-    reward: Float[Array, "*batch"], discount: Float[Array, "*batch"], value: Float[Array, "*batch"], next_value: Float[Array, "*batch"]
+    reward: Float[Array, "*batch"],
+    discount: Float[Array, "*batch"],
+    value: Float[Array, "*batch"],
+    next_value: Float[Array, "*batch"],
 ) -> Float[Array, "*batch"]:
     """δ = r + γ V(s′) − V(s) (below Eq. GAE)."""
     return reward + discount * next_value - value
@@ -89,7 +97,10 @@ def dgae(
     With the paper's L(x) = x (`weights=None`) this equals `gae` on the means of the quantiles.
     """
     discount, trace = decay(terminated, truncated, gamma=gamma, lam=lam)
-    return lambda_sum(distributional_td_residual(reward, discount, quantiles, next_quantiles, weights), discount * trace)
+    return lambda_sum(
+        distributional_td_residual(reward, discount, quantiles, next_quantiles, weights),
+        discount * trace,
+    )
 
 
 def n_step_advantage(
@@ -122,7 +133,9 @@ def n_step_advantage(
 
 
 def bellman_target(
-    reward: Float[Array, "*batch"], discount: Float[Array, "*batch"], next_quantiles: Float[Array, "*batch K"]
+    reward: Float[Array, "*batch"],
+    discount: Float[Array, "*batch"],
+    next_quantiles: Float[Array, "*batch K"],
 ) -> Float[Array, "*batch K"]:
     """𝒯G(s) = r + γ G(s′), atom by atom (Eq. G_dis_bellman; Lemma lemma1 with η = γ ≥ 0)."""
     return reward[..., None] + discount[..., None] * next_quantiles
@@ -173,4 +186,6 @@ def sr_lambda_target(
         target = bellman_target(reward, discount, jnp.where(follow, later, quantiles))
         return target, target
 
-    return jax.lax.scan(back, next_quantiles[-1], (reward, discount, next_quantiles, follow), reverse=True)[1]
+    return jax.lax.scan(
+        back, next_quantiles[-1], (reward, discount, next_quantiles, follow), reverse=True
+    )[1]

@@ -18,7 +18,9 @@ def check_spectral(weights: ArrayLike) -> np.ndarray:
     w = np.asarray(weights, np.float64)
     if w.ndim != 1 or (w < 0).any() or not abs(w.mean() - 1) < 1e-5:
         found = f"shape {w.shape}, minimum {w.min():g}, mean {w.mean():g}"
-        raise ValueError(f"spectral weights must be a vector, non-negative and of mean 1; got {found}")
+        raise ValueError(
+            f"spectral weights must be a vector, non-negative and of mean 1; got {found}"
+        )
     return w
 
 
@@ -63,7 +65,12 @@ METRICS = {
     "cvar": Metric(("α",), lambda a: 1e-6 <= a <= 1, "1e-6 ≤ α ≤ 1", cvar),
     "wang": Metric(("β",), lambda b: abs(b) <= 5, "−5 ≤ β ≤ 5", wang),
     "power": Metric(("c",), lambda c: 1e-3 <= c <= 1e3, "1e-3 ≤ c ≤ 1e3", power),
-    "mean-cvar": Metric(("α", "weight"), lambda a, w: 1e-6 <= a <= 1 and 0 <= w <= 1, "1e-6 ≤ α ≤ 1 and 0 ≤ weight ≤ 1", mean_cvar),
+    "mean-cvar": Metric(
+        ("α", "weight"),
+        lambda a, w: 1e-6 <= a <= 1 and 0 <= w <= 1,
+        "1e-6 ≤ α ≤ 1 and 0 ≤ weight ≤ 1",
+        mean_cvar,
+    ),
 }
 """User preferences join here: `METRICS["mine"] = Metric((), lambda: True, "", lambda k: weights)`."""
 

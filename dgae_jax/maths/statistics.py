@@ -9,21 +9,31 @@ from jaxtyping import Array, Float, Key
 from dgae_jax.maths.transport import quantile_midpoints
 
 
-def explained_variance(prediction: Float[Array, "*shape"], outcome: Float[Array, "*shape"]) -> Float[Array, ""]:
+def explained_variance(
+    prediction: Float[Array, "*shape"], outcome: Float[Array, "*shape"]
+) -> Float[Array, ""]:
     """1 − Var[outcome − prediction] / Var[outcome]: 1 is perfect, 0 no better than a constant.
 
     NaN where the outcome does not vary.
     """
     variance = outcome.var()
-    return jnp.where(variance > 0, 1 - (outcome - prediction).var() / jnp.where(variance > 0, variance, 1), jnp.nan)
+    return jnp.where(
+        variance > 0,
+        1 - (outcome - prediction).var() / jnp.where(variance > 0, variance, 1),
+        jnp.nan,
+    )
 
 
-def pit(quantiles: Float[Array, "*batch K"], outcome: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
+def pit(
+    quantiles: Float[Array, "*batch K"], outcome: Float[Array, "*batch"]
+) -> Float[Array, "*batch"]:
     """Probability integral transform: the share of quantiles at or below the outcome, uniform for a calibrated critic."""
     return (quantiles <= outcome[..., None]).mean(-1)
 
 
-def coverage(quantiles: Float[Array, "*batch K"], outcome: Float[Array, "*batch"], level: float = 0.9) -> Float[Array, ""]:
+def coverage(
+    quantiles: Float[Array, "*batch K"], outcome: Float[Array, "*batch"], level: float = 0.9
+) -> Float[Array, ""]:
     """Share of outcomes inside the central interval that should hold `level` of them; K quantiles give levels up to 1 − 1/K.
 
     NaN for higher levels, 0.9 with K < 10: the ends of the interval, F⁻¹((1 ± level)/2), then lie outside the midpoints 1/2K …
@@ -40,7 +50,9 @@ def coverage(quantiles: Float[Array, "*batch K"], outcome: Float[Array, "*batch"
     return ((at(tail, ordered) <= outcome) & (outcome <= at(1 - tail, ordered))).mean()
 
 
-def crps(quantiles: Float[Array, "*batch K"], outcome: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
+def crps(
+    quantiles: Float[Array, "*batch K"], outcome: Float[Array, "*batch"]
+) -> Float[Array, "*batch"]:
     """Continuous ranked probability score, 2 ∫ ρ_τ(y − F⁻¹(τ)) dτ with the pinball loss ρ at the midpoints; lower is better.
 
     Quantiles are sorted first, because a network's may cross.

@@ -20,21 +20,23 @@ def quantile_midpoints(k: int) -> Float[Array, " K"]:
     return (2 * jnp.arange(k) + 1) / (2 * k)
 
 
-NARROW = 5.0
+GAP_BIAS = 5.0
 """Subtracted from what a network says of a step between quantiles, so that they begin 0.0067 apart."""
 
 
-def about_the_mean(k: int) -> Float[Array, "steps K"]:
+def centered_cumsum(k: int) -> Float[Array, "steps K"]:
     """The matrix [K − 1, K] that makes K quantiles, less their mean, of the steps from each to the next."""
     step, at = jnp.arange(1, k)[:, None], jnp.arange(k)
     return (at >= step) - (k - step) / k
 
 
-def in_order(outputs: Float[Array, "*batch K"]) -> Float[Array, "*batch K"]:
-    """K quantiles that do not cross, but for rounding: the first output is their mean, log(1 + exp(outputᵢ − `NARROW`)) the step from
+def monotone_quantiles(outputs: Float[Array, "*batch K"]) -> Float[Array, "*batch K"]:
+    """K quantiles that do not cross, but for rounding: the first output is their mean, log(1 + exp(outputᵢ − `GAP_BIAS`)) the step from
     quantile i − 1 to quantile i.
     """
-    return outputs[..., :1] + jax.nn.softplus(outputs[..., 1:] - NARROW) @ about_the_mean(outputs.shape[-1])
+    return outputs[..., :1] + jax.nn.softplus(outputs[..., 1:] - GAP_BIAS) @ centered_cumsum(
+        outputs.shape[-1]
+    )
 
 
 def spectral_weights(weights: ArrayLike) -> Float[Array, " K"]:
@@ -42,7 +44,9 @@ def spectral_weights(weights: ArrayLike) -> Float[Array, " K"]:
 
     Raises as `check_spectral`; traced weights pass unchecked, because their values are not known yet.
     """
-    return jnp.asarray(weights if isinstance(weights, jax.core.Tracer) else check_spectral(weights), float)
+    return jnp.asarray(
+        weights if isinstance(weights, jax.core.Tracer) else check_spectral(weights), float
+    )
 
 
 def directional_metric(
@@ -59,21 +63,28 @@ def directional_metric(
     return (spectral_weights(weights) * (jnp.sort(u) - jnp.sort(v))).mean(-1)
 
 
-def wasserstein(u: Float[Array, "*#batch K"], v: Float[Array, "*#batch K"], p: float = 1) -> Float[Array, "*batch"]:
+def wasserstein(
+    u: Float[Array, "*#batch K"], v: Float[Array, "*#batch K"], p: float = 1
+) -> Float[Array, "*batch"]:
     """d_p = (∫ |F_U⁻¹(q) − F_V⁻¹(q)|ᵖ dq)^(1/p), p ≥ 1 (Prop. OT_cost)."""
     if not p >= 1:
         raise ValueError(f"the order p of a Wasserstein distance is {p}; it must be at least 1")
     return (jnp.abs(jnp.sort(u) - jnp.sort(v)) ** p).mean(-1) ** (1 / p)
 
 
-def huber(u: Float[Array, "*shape"], kappa: ArrayLike) -> tuple[Float[Array, "*shape"], Float[Array, "*shape"]]:
+def huber(
+    u: Float[Array, "*shape"], kappa: ArrayLike
+) -> tuple[Float[Array, "*shape"], Float[Array, "*shape"]]:
     """L_κ(u) = ½u² where |u| ≤ κ, κ(|u| − ½κ) beyond (below Eq. quantile_huber_loss), and its derivative, the clipped u."""
     slope = jnp.clip(u, jnp.negative(kappa), kappa)
     return slope * (u - 0.5 * slope), slope
 
 
 def quantile_huber_loss(
-    quantiles: Float[Array, "*#batch K"], target: Float[Array, "*#batch J"], *, kappa: ArrayLike = 1.0
+    quantiles: Float[Array, "*#batch K"],
+    target: Float[Array, "*#batch J"],
+    *,
+    kappa: ArrayLike = 1.0,
 ) -> Float[Array, "*batch"]:
     """Σᵢ meanⱼ |τ̂ᵢ − 1{u<0}| L_κ(u), u = targetⱼ − quantileᵢ (Eq. quantile_huber_loss), per sample.
 
@@ -90,7 +101,9 @@ def _quantile_huber(quantiles: Array, target: Array, kappa: Array) -> Array:
     return _loss_and_slopes(quantiles, target, kappa)[0]
 
 
-def _loss_and_slopes(quantiles: Array, target: Array, kappa: Array) -> tuple[Array, tuple[Array, Array]]:
+def _loss_and_slopes(
+    quantiles: Array, target: Array, kappa: Array
+) -> tuple[Array, tuple[Array, Array]]:
     """The loss and its derivatives by quantiles and targets.
 
     On a CPU one target after the other: laying out the K × J residuals of a sample would cost several times more than computing
@@ -109,7 +122,9 @@ def _loss_and_slopes(quantiles: Array, target: Array, kappa: Array) -> tuple[Arr
             return (sums[0] + distance, sums[1] - pull), pull.sum(-1)
 
         nothing = jnp.zeros_like(quantiles)
-        (loss, slope), pulls = jax.lax.scan(add, (nothing, nothing), jnp.moveaxis(target, -1, 0), unroll=_UNROLL)
+        (loss, slope), pulls = jax.lax.scan(
+            add, (nothing, nothing), jnp.moveaxis(target, -1, 0), unroll=_UNROLL
+        )
         return loss.sum(-1), slope, jnp.moveaxis(pulls, 0, -1)
 
     def at_once(quantiles: Array, target: Array) -> tuple[Array, Array, Array]:

@@ -51,7 +51,9 @@ class Physics(NamedTuple):
     """The engine's, as in `registry.ENGINES`."""
     reads: Reads
 
-    def at_pose(self, qpos: Float[Array, "*batch Q"], qvel: Float[Array, "*batch V"]) -> PhysicsState:
+    def at_pose(
+        self, qpos: Float[Array, "*batch Q"], qvel: Float[Array, "*batch V"]
+    ) -> PhysicsState:
         """The state at a pose, with the cold warm start of a fresh `mjData`: a reset costs no forward pass."""
         model, lead = self.model, qpos.shape[:-1]
         addresses = model.jnt_qposadr[model.body_jntadr[body_ids(model, self.reads)]]
@@ -78,7 +80,12 @@ def body_ids(model: mujoco.MjModel, reads: Reads) -> np.ndarray:
 
 def refuse_hidden_state(model: mujoco.MjModel, name: str) -> None:
     """Raise ValueError, naming it, for a model with a state that `PhysicsState` does not carry from step to step."""
-    sizes = {"activations": "na", "histories": "nhistory", "plugin states": "npluginstate", "user data": "nuserdata"}
+    sizes = {
+        "activations": "na",
+        "histories": "nhistory",
+        "plugin states": "npluginstate",
+        "user data": "nuserdata",
+    }
     found = [what for what, size in sizes.items() if getattr(model, size, 0)]
     if found:
         raise ValueError(f"physics {name} does not cover {', '.join(found)}, which the model has")

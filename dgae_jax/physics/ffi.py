@@ -37,7 +37,11 @@ class _Buffer(_Struct):
 
 
 class _Buffers(_Struct):
-    _fields_ = (("size", ctypes.c_int64), ("types", ctypes.c_void_p), ("buffers", ctypes.POINTER(ctypes.POINTER(_Buffer))))
+    _fields_ = (
+        ("size", ctypes.c_int64),
+        ("types", ctypes.c_void_p),
+        ("buffers", ctypes.POINTER(ctypes.POINTER(_Buffer))),
+    )
 
 
 class _Version(_Struct):
@@ -45,7 +49,11 @@ class _Version(_Struct):
 
 
 class _Metadata(ctypes.Structure):
-    _fields_ = (("struct_size", ctypes.c_size_t), ("version", _Version), ("traits", ctypes.c_uint32))
+    _fields_ = (
+        ("struct_size", ctypes.c_size_t),
+        ("version", _Version),
+        ("traits", ctypes.c_uint32),
+    )
 
 
 class _MetadataRequest(ctypes.Structure):
@@ -90,13 +98,17 @@ def register(name: str, function: Function) -> None:
     """
     if name not in _registered:
         _registered[name] = handler = _Handler(functools.partial(_handle, function))
-        jax.ffi.register_ffi_target(name, jax.ffi.pycapsule(ctypes.cast(handler, ctypes.c_void_p)), platform="cpu")
+        jax.ffi.register_ffi_target(
+            name, jax.ffi.pycapsule(ctypes.cast(handler, ctypes.c_void_p)), platform="cpu"
+        )
 
 
 def _handle(function: Function, pointer) -> int | None:
     frame = pointer.contents
     if frame.extension:  # XLA asks for the version and no more
-        metadata = ctypes.cast(frame.extension, ctypes.POINTER(_MetadataRequest)).contents.metadata.contents
+        metadata = ctypes.cast(
+            frame.extension, ctypes.POINTER(_MetadataRequest)
+        ).contents.metadata.contents
         metadata.version.major, metadata.version.minor, metadata.traits = _MAJOR, _MINOR, 0
         return None
     try:
@@ -113,8 +125,12 @@ def _arrays(buffers: _Buffers) -> list[np.ndarray]:
     return [_view(buffer.data, buffer.dtype, tuple(buffer.dims[: buffer.rank])) for buffer in each]
 
 
-@functools.lru_cache(1024)  # a loop calls with the same buffers again and again; a view lives only through one call
+@functools.lru_cache(
+    1024
+)  # a loop calls with the same buffers again and again; a view lives only through one call
 def _view(address: int | None, dtype: int, shape: tuple[int, ...]) -> np.ndarray:
     number = np.dtype(_DTYPES[dtype])
-    memory = (ctypes.c_char * (math.prod(shape) * number.itemsize)).from_address(address or 0)  # no elements, no address
+    memory = (ctypes.c_char * (math.prod(shape) * number.itemsize)).from_address(
+        address or 0
+    )  # no elements, no address
     return np.ndarray(shape, number, memory)  # pyright: ignore[reportArgumentType, reportCallIssue]

@@ -15,7 +15,9 @@ from jaxtyping import Array
 from dgae_jax.physics.engine import Physics, PhysicsState, Reads, body_ids, refuse_hidden_state
 from dgae_jax.physics.worlds import of_one_world
 
-with contextlib.redirect_stdout(io.StringIO()):  # MJX prints that it has no Warp, which is no news here
+with contextlib.redirect_stdout(
+    io.StringIO()
+):  # MJX prints that it has no Warp, which is no news here
     from mujoco import mjx as upstream
 
 
@@ -26,8 +28,14 @@ def mjx(spec: mujoco.MjSpec, frame_skip: int, reads: Reads) -> Physics:
 
     @jax.default_matmul_precision("highest")  # TF32 on GPUs is too coarse for dynamics
     def step(state: PhysicsState, ctrl: Array) -> PhysicsState:
-        data = _advance(device_model, upstream.make_data(model, impl="jax"), state, ctrl, frame_skip)
-        forces = upstream.rne_postconstraint(device_model, data)._impl.cfrc_ext if reads.forces else state.cfrc_ext
+        data = _advance(
+            device_model, upstream.make_data(model, impl="jax"), state, ctrl, frame_skip
+        )
+        forces = (
+            upstream.rne_postconstraint(device_model, data)._impl.cfrc_ext
+            if reads.forces
+            else state.cfrc_ext
+        )
         return PhysicsState(data.qpos, data.qvel, data.qacc_warmstart, data.xpos[bodies], forces)
 
     return Physics(model, step, "mjx", reads)
@@ -43,7 +51,9 @@ def mjx_warp(spec: mujoco.MjSpec, frame_skip: int, reads: Reads) -> Physics:
 
     warp.config.log_level = warp.LOG_WARNING  # it announces itself and every kernel that it loads
     model, bodies = _compiled(spec, reads, "mjx-warp")
-    device_model: Any = _put(model, "warp", "mjx-warp").tree_replace({"opt._impl.run_rne_postconstraint": reads.forces})
+    device_model: Any = _put(model, "warp", "mjx-warp").tree_replace(
+        {"opt._impl.run_rne_postconstraint": reads.forces}
+    )
     contacts = upstream.make_data(model, impl="warp")._impl.naconmax
 
     def advance(state: PhysicsState, ctrl: Array) -> PhysicsState:
@@ -52,7 +62,9 @@ def mjx_warp(spec: mujoco.MjSpec, frame_skip: int, reads: Reads) -> Physics:
         def one(state: PhysicsState, ctrl: Array) -> PhysicsState:
             data = _advance(device_model, blank, state, ctrl, frame_skip)
             forces = data._impl.cfrc_ext if reads.forces else state.cfrc_ext
-            return PhysicsState(data.qpos, data.qvel, data.qacc_warmstart, data.xpos[bodies], forces)
+            return PhysicsState(
+                data.qpos, data.qvel, data.qacc_warmstart, data.xpos[bodies], forces
+            )
 
         single = jax.tree.map(lambda x: x.astype(jnp.float32), (state, ctrl))
         after = jax.vmap(one, -1, -1)(*single)
@@ -78,6 +90,12 @@ def _put(model: mujoco.MjModel, impl: str, name: str) -> upstream.Model:
         raise ValueError(f"physics {name} does not cover this model: {reason}") from None
 
 
-def _advance(model: upstream.Model, data: upstream.Data, state: PhysicsState, ctrl: Array, frame_skip: int) -> upstream.Data:
-    data = data.replace(qpos=state.qpos, qvel=state.qvel, qacc_warmstart=state.qacc_warmstart, ctrl=ctrl)
-    return jax.lax.scan(lambda d, _: (upstream.step(model, d), None), data, None, length=frame_skip)[0]
+def _advance(
+    model: upstream.Model, data: upstream.Data, state: PhysicsState, ctrl: Array, frame_skip: int
+) -> upstream.Data:
+    data = data.replace(
+        qpos=state.qpos, qvel=state.qvel, qacc_warmstart=state.qacc_warmstart, ctrl=ctrl
+    )
+    return jax.lax.scan(
+        lambda d, _: (upstream.step(model, d), None), data, None, length=frame_skip
+    )[0]

@@ -26,7 +26,12 @@ class _Host:
     """Keeps simulations per batch size, and takes others where those are in use: CPU devices of JAX call side by side."""
 
     def __init__(self, model: mujoco.MjModel, frame_skip: int, reads: Reads):
-        self.model, self.frame_skip, self.reads, self.bodies = model, frame_skip, reads, body_ids(model, reads)
+        self.model, self.frame_skip, self.reads, self.bodies = (
+            model,
+            frame_skip,
+            reads,
+            body_ids(model, reads),
+        )
         self.free: dict[int, list[Batch]] = {}
 
     def step(self, before: Sequence[np.ndarray], after: Sequence[np.ndarray]) -> None:
@@ -39,7 +44,11 @@ class _Host:
             batch.step(nstep=self.frame_skip)
             quiet.count(_warnings(batch) - warned)
             forces = self._forces(batch) if self.reads.forces else np.empty((count, 0, 6))
-            for array, value in zip(after, (*map(batch.bind, _FIELDS), batch.bind("xpos")[:, self.bodies], forces), strict=True):
+            for array, value in zip(
+                after,
+                (*map(batch.bind, _FIELDS), batch.bind("xpos")[:, self.bodies], forces),
+                strict=True,
+            ):
                 array[:] = value.reshape(array.shape)
 
     def returned(self, like: Sequence[jax.ShapeDtypeStruct], *before) -> tuple[np.ndarray, ...]:
@@ -96,9 +105,13 @@ def native(spec: mujoco.MjSpec, frame_skip: int, reads: Reads) -> Physics:
         on_cpu = jax.ffi.ffi_call(name, like, vmap_method="broadcast_all")
 
         def elsewhere(*before):  # JAX's device is not the CPU
-            return jax.pure_callback(partial(host.returned, like), like, *before, vmap_method="broadcast_all")
+            return jax.pure_callback(
+                partial(host.returned, like), like, *before, vmap_method="broadcast_all"
+            )
 
-        return PhysicsState(*jax.lax.platform_dependent(*state[:3], ctrl, cpu=on_cpu, default=elsewhere))
+        return PhysicsState(
+            *jax.lax.platform_dependent(*state[:3], ctrl, cpu=on_cpu, default=elsewhere)
+        )
 
     return Physics(model, step, "native", reads)
 

@@ -13,7 +13,10 @@ _LOG = logging.getLogger(__name__)
 COUNTS: Counter[str] = Counter()
 """How often C MuJoCo warned in this process while `native` stepped, by MuJoCo's name of the warning."""
 
-KINDS = tuple(mujoco.mjtWarning(i).name.removeprefix("mjWARN_") for i in range(int(mujoco.mjtWarning.mjNWARNING)))
+KINDS = tuple(
+    mujoco.mjtWarning(i).name.removeprefix("mjWARN_")
+    for i in range(int(mujoco.mjtWarning.mjNWARNING))
+)
 """BADQACC, CONTACTFULL, …: in MuJoCo's order."""
 
 
@@ -43,6 +46,9 @@ def count(numbers: np.ndarray) -> None:
     """Add new warnings, one number per kind; the first of each kind is said in one line, the others only counted."""
     for kind, number in zip(KINDS, numbers, strict=True):
         if number and kind not in COUNTS:
-            _LOG.warning("MuJoCo warns of %s in physics native; from now on its warnings are counted, not shown", kind)
+            _LOG.warning(
+                "MuJoCo warns of %s in physics native; from now on its warnings are counted, not shown",
+                kind,
+            )
         if number:
             COUNTS[kind] += int(number)

@@ -26,9 +26,18 @@ class Engine(NamedTuple):
 
 
 ENGINES = {
-    "jax": Engine("dgae_jax.physics.jax.engine:jax_engine", "MuJoCo's stages in our own JAX code, CPU or GPU"),
-    "mjx": Engine("dgae_jax.physics.mjx:mjx", "google-deepmind's MuJoCo MJX, unchanged, any device"),
-    "mjx-warp": Engine("dgae_jax.physics.mjx:mjx_warp", "MuJoCo MJX over MuJoCo Warp, NVIDIA GPUs", package="warp", extra="warp"),
+    "jax": Engine(
+        "dgae_jax.physics.jax.engine:jax_engine", "MuJoCo's stages in our own JAX code, CPU or GPU"
+    ),
+    "mjx": Engine(
+        "dgae_jax.physics.mjx:mjx", "google-deepmind's MuJoCo MJX, unchanged, any device"
+    ),
+    "mjx-warp": Engine(
+        "dgae_jax.physics.mjx:mjx_warp",
+        "MuJoCo MJX over MuJoCo Warp, NVIDIA GPUs",
+        package="warp",
+        extra="warp",
+    ),
     "native": Engine("dgae_jax.physics.native:native", "C MuJoCo, CPU", on_host=True),
 }
 
@@ -39,7 +48,9 @@ def require(name: str) -> None:
         raise ValueError(f"unknown physics {name!r}: must be one of {', '.join(ENGINES)}")
     package, extra = ENGINES[name].package, ENGINES[name].extra
     if package is not None and find_spec(package) is None:
-        raise ValueError(f'physics {name} needs the package {package}, which is not installed: pip install "dgae_jax[{extra}]"')
+        raise ValueError(
+            f'physics {name} needs the package {package}, which is not installed: pip install "dgae_jax[{extra}]"'
+        )
 
 
 def make_physics(name: str, spec: "mujoco.MjSpec", frame_skip: int, reads: "Reads") -> "Physics":

@@ -27,9 +27,13 @@ def of_one_world(advance: Step) -> Step:
             return x.reshape(*x.shape[:-2], size * worlds)
 
         out = many(*jax.tree.map(merge, args, tuple(batched)))
-        return jax.tree.map(lambda x: jnp.moveaxis(x.reshape(*x.shape[:-1], size, worlds), -2, 0), out), jax.tree.map(lambda _: True, out)
+        return jax.tree.map(
+            lambda x: jnp.moveaxis(x.reshape(*x.shape[:-1], size, worlds), -2, 0), out
+        ), jax.tree.map(lambda _: True, out)
 
     def step(state: PhysicsState, ctrl: Array) -> PhysicsState:
-        return jax.tree.map(lambda x: x[..., 0], many(*jax.tree.map(lambda x: x[..., None], (state, ctrl))))
+        return jax.tree.map(
+            lambda x: x[..., 0], many(*jax.tree.map(lambda x: x[..., None], (state, ctrl)))
+        )
 
     return step

@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from dgae_jax.configs.algorithms import TABLE
+from dgae_jax.configs.algorithms import ALGORITHMS
 from dgae_jax.report import statistics
 from dgae_jax.report.groups import Group, by_task
 
@@ -43,9 +43,13 @@ def interquartile_mean(scores: np.ndarray) -> Estimate:
 
 def pairs() -> Iterator[tuple[str, str]]:
     """Each distributional algorithm with the scalar one that updates its policy in the same way."""
-    for name, row in TABLE.items():
+    for name, row in ALGORITHMS.items():
         if row.residual == "distributional":
-            yield from ((name, o) for o, other in TABLE.items() if (other.residual, other.policy_update) == ("td", row.policy_update))
+            yield from (
+                (name, o)
+                for o, other in ALGORITHMS.items()
+                if (other.residual, other.policy_update) == ("td", row.policy_update)
+            )
 
 
 def improvements(groups: Iterable[Group]) -> list[Improvement]:
@@ -85,7 +89,14 @@ def normalised(groups: Iterable[Group]) -> dict[str, tuple[Group, list[np.ndarra
 
 def best_mean(groups: Iterable[Group]) -> float | None:
     """The highest mean over seeds of the return while training, of all these groups; None where no episode has ended."""
-    return max((float(curve.mean(0).max()) for _, curve in (group.curve for group in groups) if curve.size), default=None)
+    return max(
+        (
+            float(curve.mean(0).max())
+            for _, curve in (group.curve for group in groups)
+            if curve.size
+        ),
+        default=None,
+    )
 
 
 def reached(group: Group, best: float | None) -> list[int | None]:
@@ -93,4 +104,7 @@ def reached(group: Group, best: float | None) -> list[int | None]:
     if best is None or best <= 0:
         return [None] * len(REACH)
     steps, curve = group.curve
-    return [statistics.steps_to_reach(steps, curve.mean(0), share * best) if curve.size else None for share in REACH]
+    return [
+        statistics.steps_to_reach(steps, curve.mean(0), share * best) if curve.size else None
+        for share in REACH
+    ]

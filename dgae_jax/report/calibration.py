@@ -26,17 +26,31 @@ def histograms(found: Mapping[str, tuple[str, dict[str, Any]]]) -> Figure:
     with mpl.rc_context(LOOK):
         columns = min(3, len(found))
         rows = -(-len(found) // columns)
-        figure = Figure(figsize=(PANEL[0] * columns, PANEL[1] * rows), layout="constrained", dpi=150)
+        figure = Figure(
+            figsize=(PANEL[0] * columns, PANEL[1] * rows), layout="constrained", dpi=150
+        )
         panels = np.atleast_1d(figure.subplots(rows, columns, sharey=True)).ravel()
         for axes in panels[len(found) :]:
             axes.remove()
         for axes, (name, (algo, statistics)) in zip(panels, found.items(), strict=False):
             shares = np.array(statistics["pit"])
             edges = np.linspace(0, 1, len(shares) + 1)
-            axes.bar(edges[:-1], shares, np.diff(edges), align="edge", color=look(algo).colour, edgecolor="white", linewidth=0.5)
+            axes.bar(
+                edges[:-1],
+                shares,
+                np.diff(edges),
+                align="edge",
+                color=look(algo).colour,
+                edgecolor="white",
+                linewidth=0.5,
+            )
             axes.axhline(1 / len(shares), color=FAINT, linestyle=":", label="calibrated")
             title = f"{name}\n{held(statistics)}"
-            axes.set(title=title, xlabel="share of the quantiles below the return that came", ylabel="returns")
+            axes.set(
+                title=title,
+                xlabel="share of the quantiles below the return that came",
+                ylabel="returns",
+            )
             axes.yaxis.set_major_formatter(PercentFormatter(1, decimals=0))
         panels[0].legend()
     return figure

@@ -11,7 +11,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter, PercentFormatter
 
-from dgae_jax.configs.algorithms import TABLE
+from dgae_jax.configs.algorithms import ALGORITHMS
 from dgae_jax.report import analysis, statistics
 from dgae_jax.report.groups import Group, by_task
 from dgae_jax.report.published import Published
@@ -40,24 +40,60 @@ class Mark(NamedTuple):
 
 def learning_curves(groups: Iterable[Group], published: Sequence[Published] = ()) -> Figure:
     """A panel per task: mean over seeds, ± one standard deviation, of the return while training; crosses are published results."""
-    return _panels(groups, lambda axes, task, members: _curves(axes, task, members, published), PANEL[1])
+    return _panels(
+        groups, lambda axes, task, members: _curves(axes, task, members, published), PANEL[1]
+    )
 
 
-def _curves(axes: Axes, task: str, members: Sequence[Group], published: Sequence[Published]) -> None:
+def _curves(
+    axes: Axes, task: str, members: Sequence[Group], published: Sequence[Published]
+) -> None:
     for group in members:
         steps, curve = group.curve
         if not curve.size:
             continue
-        style, mean, std = look(group.algo, group.number), curve.mean(0), curve.std(0, ddof=min(1, len(curve) - 1))
-        axes.plot(steps, mean, style.line, color=style.colour, marker=style.marker, markevery=0.1, markersize=4, label=group.name)
-        axes.fill_between(steps, mean - std, mean + std, color=style.colour, alpha=0.12, linewidth=0)
+        style, mean, std = (
+            look(group.algo, group.number),
+            curve.mean(0),
+            curve.std(0, ddof=min(1, len(curve) - 1)),
+        )
+        axes.plot(
+            steps,
+            mean,
+            style.line,
+            color=style.colour,
+            marker=style.marker,
+            markevery=0.1,
+            markersize=4,
+            label=group.name,
+        )
+        axes.fill_between(
+            steps, mean - std, mean + std, color=style.colour, alpha=0.12, linewidth=0
+        )
     end = max(row.total_steps for group in members for row in group.rows)
-    marks = [mark for mark in published if mark.task == members[0].rows[0].env and mark.samples <= end]
-    for number, mark in enumerate(marks):  # beside each other, a little to the right of their samples
-        known = mark.algorithm.lower() in TABLE
-        colour, at = look(mark.algorithm.lower()).colour if known else OTHER, mark.samples + (1 + number) * 0.015 * end
+    marks = [
+        mark for mark in published if mark.task == members[0].rows[0].env and mark.samples <= end
+    ]
+    for number, mark in enumerate(
+        marks
+    ):  # beside each other, a little to the right of their samples
+        known = mark.algorithm.lower() in ALGORITHMS
+        colour, at = (
+            look(mark.algorithm.lower()).colour if known else OTHER,
+            mark.samples + (1 + number) * 0.015 * end,
+        )
         label = f"{mark.algorithm}, published"
-        axes.errorbar(at, mark.mean, mark.spread, fmt="x", markersize=5, capsize=2, linewidth=1, color=colour, label=label)
+        axes.errorbar(
+            at,
+            mark.mean,
+            mark.spread,
+            fmt="x",
+            markersize=5,
+            capsize=2,
+            linewidth=1,
+            color=colour,
+            label=label,
+        )
     axes.set(title=task, xlabel="environment steps", ylabel="episode return")
     axes.xaxis.set_major_formatter(EngFormatter(sep=""))
     axes.margins(x=0.02)
@@ -68,7 +104,10 @@ def final_returns(groups: Iterable[Group]) -> Figure:
     groups = list(groups)
 
     def panel(axes: Axes, task: str, members: Sequence[Group]) -> None:
-        marks = [Mark(g.name, look(g.algo, g.number), analysis.interquartile_mean(g.finals), g.finals) for g in members]
+        marks = [
+            Mark(g.name, look(g.algo, g.number), analysis.interquartile_mean(g.finals), g.finals)
+            for g in members
+        ]
         _dots(axes, marks)
         axes.set(title=task, xlabel="return of the last policy")
 
@@ -82,7 +121,11 @@ def speed(groups: Iterable[Group]) -> Figure:
     def panel(axes: Axes, task: str, members: Sequence[Group]) -> None:
         rates = [np.array([row.samples_per_second for row in group.rows]) for group in members]
         _dots(
-            axes, [Mark(g.name, look(g.algo, g.number), analysis.Estimate(r.mean(), None), r) for g, r in zip(members, rates, strict=True)]
+            axes,
+            [
+                Mark(g.name, look(g.algo, g.number), analysis.Estimate(r.mean(), None), r)
+                for g, r in zip(members, rates, strict=True)
+            ],
         )
         axes.set(title=task, xlabel="samples per second")
         axes.set_xlim(0, 1.1 * max(rate.max() for rate in rates))
@@ -94,7 +137,12 @@ def speed(groups: Iterable[Group]) -> Figure:
 def improvement(found: Sequence[analysis.Improvement]) -> Figure:
     """Probability that a seed with a distribution scores more than one without, per task and pair."""
     marks = [
-        Mark(f"{duel.better.name} > {duel.worse.name}\n{duel.task}", look(duel.better.algo, duel.better.number), duel.estimate, np.empty(0))
+        Mark(
+            f"{duel.better.name} > {duel.worse.name}\n{duel.task}",
+            look(duel.better.algo, duel.better.number),
+            duel.estimate,
+            np.empty(0),
+        )
         for duel in found
     ]
     with mpl.rc_context(LOOK):
@@ -102,7 +150,11 @@ def improvement(found: Sequence[analysis.Improvement]) -> Figure:
         axes = figure.subplots()
         _dots(axes, marks)
         axes.axvline(0.5, color=FAINT, linewidth=1)
-        axes.set(title="Distribution against scalar", xlabel="probability of improvement", xlim=(-0.03, 1.03))
+        axes.set(
+            title="Distribution against scalar",
+            xlabel="probability of improvement",
+            xlim=(-0.03, 1.03),
+        )
         axes.xaxis.set_major_formatter(PercentFormatter(1))
     return figure
 
@@ -116,12 +168,29 @@ def performance_profile(groups: Iterable[Group]) -> Figure:
         figure = Figure(figsize=PANEL, layout="constrained", dpi=150)
         axes = figure.subplots()
         for name, (group, strata) in scores.items():
-            style, between = look(group.algo, group.number), statistics.interval(lambda s: statistics.performance_profile(s, taus), strata)
+            style, between = (
+                look(group.algo, group.number),
+                statistics.interval(lambda s: statistics.performance_profile(s, taus), strata),
+            )
             shares = statistics.performance_profile(strata, taus)
-            axes.plot(taus, shares, style.line, color=style.colour, marker=style.marker, markevery=20, markersize=4, label=name)
+            axes.plot(
+                taus,
+                shares,
+                style.line,
+                color=style.colour,
+                marker=style.marker,
+                markevery=20,
+                markersize=4,
+                label=name,
+            )
             if between is not None:
                 axes.fill_between(taus, *between, color=style.colour, alpha=0.12, linewidth=0)
-        axes.set(title="Performance profile", xlabel="normalised score τ", ylabel="share of runs above τ", ylim=(-0.02, 1.02))
+        axes.set(
+            title="Performance profile",
+            xlabel="normalised score τ",
+            ylabel="share of runs above τ",
+            ylim=(-0.02, 1.02),
+        )
         axes.yaxis.set_major_formatter(PercentFormatter(1))
         _legend(figure, [axes])
     return figure
@@ -130,11 +199,34 @@ def performance_profile(groups: Iterable[Group]) -> Figure:
 def _dots(axes: Axes, marks: Sequence[Mark]) -> None:
     """Rows from top to bottom."""
     for y, mark in enumerate(marks):
-        axes.plot(mark.dots, np.full(len(mark.dots), y), "|", color=mark.look.colour, markersize=7, alpha=0.6)
+        axes.plot(
+            mark.dots,
+            np.full(len(mark.dots), y),
+            "|",
+            color=mark.look.colour,
+            markersize=7,
+            alpha=0.6,
+        )
         if mark.estimate.interval is not None:
-            axes.plot(mark.estimate.interval, [y, y], "-", color=mark.look.colour, linewidth=2.2, alpha=0.6, solid_capstyle="butt")
+            axes.plot(
+                mark.estimate.interval,
+                [y, y],
+                "-",
+                color=mark.look.colour,
+                linewidth=2.2,
+                alpha=0.6,
+                solid_capstyle="butt",
+            )
         shape = mark.look.marker or "o"
-        axes.plot(mark.estimate.value, y, shape, color=mark.look.colour, markerfacecolor=mark.look.fill, markersize=6, zorder=3)
+        axes.plot(
+            mark.estimate.value,
+            y,
+            shape,
+            color=mark.look.colour,
+            markerfacecolor=mark.look.fill,
+            markersize=6,
+            zorder=3,
+        )
     axes.set_yticks(range(len(marks)), [mark.label for mark in marks])
     axes.set_ylim(len(marks) - 0.5, -0.5)
     axes.grid(axis="y", visible=False)
@@ -145,13 +237,22 @@ def _height(rows: int, each: float = 0.28) -> float:
     return 0.9 + each * rows
 
 
-def _panels(groups: Iterable[Group], draw: Callable[[Axes, str, Sequence[Group]], None], height: float, legend: bool = True) -> Figure:
+def _panels(
+    groups: Iterable[Group],
+    draw: Callable[[Axes, str, Sequence[Group]], None],
+    height: float,
+    legend: bool = True,
+) -> Figure:
     """A panel per task, two side by side, and one legend for all."""
     tasks = by_task(groups)
     columns = min(2, len(tasks))
     rows = -(-len(tasks) // columns)
     with mpl.rc_context(LOOK):
-        figure = Figure(figsize=(columns * PANEL[0], rows * height + 0.5 * legend), layout="constrained", dpi=150)
+        figure = Figure(
+            figsize=(columns * PANEL[0], rows * height + 0.5 * legend),
+            layout="constrained",
+            dpi=150,
+        )
         figure.set_layout_engine("constrained", h_pad=0.1)
         panels = list(figure.subplots(rows, columns, squeeze=False).flat)
         for axes, (task, members) in zip(panels, tasks.items(), strict=False):
@@ -174,7 +275,15 @@ def _legend(figure: Figure, panels: Sequence[Axes]) -> None:
     ordered = sorted(handles.items(), key=lambda item: colours.index(item[1][0]))
     if ordered:
         labels, shown = [label for label, _ in ordered], [handle for _, (_, handle) in ordered]
-        figure.legend(shown, labels, loc="outside lower center", ncols=min(3, len(labels)), fontsize=8, handlelength=2.4, columnspacing=1.2)
+        figure.legend(
+            shown,
+            labels,
+            loc="outside lower center",
+            ncols=min(3, len(labels)),
+            fontsize=8,
+            handlelength=2.4,
+            columnspacing=1.2,
+        )
 
 
 def svg(figure: Figure) -> bytes:
@@ -184,7 +293,10 @@ def svg(figure: Figure) -> bytes:
 
 def save(figure: Figure, path: Path) -> list[Path]:
     """Write `path`.png and `path`.svg, each complete or not at all."""
-    written = {path.with_name(path.name + ".png"): _written(figure, "png"), path.with_name(path.name + ".svg"): svg(figure)}
+    written = {
+        path.with_name(path.name + ".png"): _written(figure, "png"),
+        path.with_name(path.name + ".svg"): svg(figure),
+    }
     for file, data in written.items():
         files.replace(file, data)
     return list(written)

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from dgae_jax.configs.algorithms import TABLE
+from dgae_jax.configs.algorithms import ALGORITHMS
 from dgae_jax.configs.serial import flat
 from dgae_jax.envs.registry import TASKS
 from dgae_jax.report import statistics
@@ -59,9 +59,17 @@ def groups_of(rows: Iterable[Row]) -> list[Group]:
     """All groups, by task and algorithm in the order of their tables, then as the study has them."""
     by_kind: dict[tuple[str, str], dict[tuple[str | None, str], list[Row]]] = {}
     for row in sorted(rows, key=order):
-        by_kind.setdefault((row.task, row.algo), {}).setdefault((row.variant, row.hash), []).append(row)
+        by_kind.setdefault((row.task, row.algo), {}).setdefault((row.variant, row.hash), []).append(
+            row
+        )
     return [
-        Group(task, algo, _variant(next(iter(variants.values()))[0], members[0], number), number, tuple(members))
+        Group(
+            task,
+            algo,
+            _variant(next(iter(variants.values()))[0], members[0], number),
+            number,
+            tuple(members),
+        )
         for (task, algo), variants in by_kind.items()
         for number, members in enumerate(variants.values())
     ]
@@ -77,20 +85,30 @@ def by_task(groups: Iterable[Group]) -> dict[str, list[Group]]:
 
 def shown(value: Any) -> str:
     """The value of a setting as it is written on a command line."""
-    return " ".join(map(str, value)) if isinstance(value, list) else "–" if value is None else str(value)
+    return (
+        " ".join(map(str, value))
+        if isinstance(value, list)
+        else "–"
+        if value is None
+        else str(value)
+    )
 
 
 def order(row: Row) -> tuple:
     """What rows are sorted by: task, algorithm, seed; what is alike in these stays as the study has it."""
     tasks = list(TASKS)
     place = tasks.index(row.env) if row.env in tasks else len(tasks)
-    return place, row.task, list(TABLE).index(row.algo), row.seed
+    return place, row.task, list(ALGORITHMS).index(row.algo), row.seed
 
 
 def _variant(first: Row, other: Row, number: int, most: int = 3) -> str:
     if other.variant or not number:
         return (other.variant or "").removesuffix("+noise")  # the task says so
     ours, theirs = flat(first.config), flat(other.config)
-    differ = [name for name in {**ours, **theirs} if name not in SEEDS and ours.get(name) != theirs.get(name)]
+    differ = [
+        name
+        for name in {**ours, **theirs}
+        if name not in SEEDS and ours.get(name) != theirs.get(name)
+    ]
     named = [f"{name} {shown(theirs.get(name))}" for name in differ[:most]] or [other.hash]
     return ", ".join(named) + (f" and {len(differ) - most} more" if len(differ) > most else "")

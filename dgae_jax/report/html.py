@@ -24,11 +24,17 @@ def paragraph(text: str, kind: str = "") -> str:
 def table(content: Table, marked: Iterable[tuple[int, int]] = ()) -> str:
     """A table that scrolls inside its box; `marked` are (row, column) to highlight."""
     marked = set(marked)
-    head = "".join(f'<th scope="col"{KEY if x < content.keys else ""}>{escape(cell)}</th>' for x, cell in enumerate(content.header))
+    head = "".join(
+        f'<th scope="col"{KEY if x < content.keys else ""}>{escape(cell)}</th>'
+        for x, cell in enumerate(content.header)
+    )
     above = ["", *(row[0] for row in content.rows)]
     body = "".join(
         ('<tr class="next">' if row[0] != above[y] and content.keys > 1 else "<tr>")
-        + "".join(_cell(text, column < content.keys, (y, column) in marked) for column, text in enumerate(row))
+        + "".join(
+            _cell(text, column < content.keys, (y, column) in marked)
+            for column, text in enumerate(row)
+        )
         + "</tr>"
         for y, row in enumerate(content.rows)
     )
@@ -79,7 +85,9 @@ def _inline(markdown: str) -> str:
 
 def navigation(links: Iterable[tuple[str, str]]) -> str:
     """Links to headings: words and anchor of each."""
-    items = "".join(f'<li><a href="#{escape(anchor)}">{escape(words)}</a></li>' for words, anchor in links)
+    items = "".join(
+        f'<li><a href="#{escape(anchor)}">{escape(words)}</a></li>' for words, anchor in links
+    )
     return f'<nav aria-label="Contents"><ul>{items}</ul></nav>'
 
 

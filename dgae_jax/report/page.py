@@ -43,10 +43,19 @@ def page(studies: Sequence[Study], published: Sequence[Published] = ()) -> str:
             if inside:
                 body.append(html.heading(3 if several else 2, name, anchor) + inside)
                 links += [] if several else [(name, anchor)]
-    body.append(html.heading(2, "Deviations from the paper", "deviations") + html.listing(deviations(), ordered=True))
-    links = [*([("Comparison", "comparison")] if several else []), *links, ("Deviations from the paper", "deviations")]
+    body.append(
+        html.heading(2, "Deviations from the paper", "deviations")
+        + html.listing(deviations(), ordered=True)
+    )
+    links = [
+        *([("Comparison", "comparison")] if several else []),
+        *links,
+        ("Deviations from the paper", "deviations"),
+    ]
     top = html.heading(1, title, "top") + html.navigation(links)
-    return html.document(title, files("dgae_jax.report").joinpath("page.css").read_text(), "\n".join([top, *body]))
+    return html.document(
+        title, files("dgae_jax.report").joinpath("page.css").read_text(), "\n".join([top, *body])
+    )
 
 
 def _compared(contents: Sequence[Content]) -> str:
@@ -60,13 +69,24 @@ def _compared(contents: Sequence[Content]) -> str:
 
 
 def _summary(content: Content) -> str:
-    rows, diverged = content.study.rows, [f"seed {seed} of {cell}" for cell, seed in content.study.diverged]
+    rows, diverged = (
+        content.study.rows,
+        [f"seed {seed} of {cell}" for cell, seed in content.study.diverged],
+    )
     seeds, steps = len({row.seed for row in rows}), sorted({row.total_steps for row in rows})
     budget = f"{steps[0]:,}" if len(steps) == 1 else f"{steps[0]:,} to {steps[-1]:,}"
-    counts = {"task": len(content.tasks), "algorithm": len({group.algo for group in content.groups}), "seed": seeds}
+    counts = {
+        "task": len(content.tasks),
+        "algorithm": len({group.algo for group in content.groups}),
+        "seed": seeds,
+    }
     told = ", ".join(counted(number, noun) for noun, number in counts.items())
     text = f"{counted(len(rows), 'trained run')}: {told}, {budget} environment steps each."
-    return text + _named("Cells without a result", content.study.missing) + _named("Left out, because their return is not finite", diverged)
+    return (
+        text
+        + _named("Cells without a result", content.study.missing)
+        + _named("Left out, because their return is not finite", diverged)
+    )
 
 
 def _named(what: str, names: Sequence[str], most: int = 10) -> str:
@@ -76,7 +96,10 @@ def _named(what: str, names: Sequence[str], most: int = 10) -> str:
 
 def _returns(content: Content) -> str:
     pictures = [
-        html.picture(figures.svg(figures.final_returns(members)), f"Final returns on {task}: {_said(members)}.")
+        html.picture(
+            figures.svg(figures.final_returns(members)),
+            f"Final returns on {task}: {_said(members)}.",
+        )
         for task, members in content.tasks.items()
     ]
     engines = " and ".join(sorted({row.engine for row in content.study.rows}))
@@ -103,9 +126,16 @@ def _curves(content: Content) -> str:
         pictures.append(html.picture(figures.svg(figure), alt))
     note = (
         "Undiscounted episode return while training, mean and standard deviation over seeds. Solid: with a value distribution; dashed: with"
-        " a scalar critic." + (" Crosses are published results, beside their number of samples." if content.published else "")
+        " a scalar critic."
+        + (
+            " Crosses are published results, beside their number of samples."
+            if content.published
+            else ""
+        )
     )
-    known = [one for one in content.published if one.task in {row.env for row in content.study.rows}]
+    known = [
+        one for one in content.published if one.task in {row.env for row in content.study.rows}
+    ]
     sources = html.details("Published results", html.table(tables.others(known))) if known else ""
     return html.gallery(pictures, note) + sources
 
@@ -114,11 +144,14 @@ def _improvement(content: Content) -> str:
     found = analysis.improvements(content.groups)
     if not found:
         return ""
-    said = "; ".join(f"{duel.better.name} over {duel.worse.name} on {duel.task} {duel.estimate.value:.2f}" for duel in found)
-    note = (
-        "Probability that a seed of the first scores a higher final return than one of the second, ties counted half; 0.5 is no difference."
+    said = "; ".join(
+        f"{duel.better.name} over {duel.worse.name} on {duel.task} {duel.estimate.value:.2f}"
+        for duel in found
     )
-    picture = html.picture(figures.svg(figures.improvement(found)), f"Probability of improvement: {said}.")
+    note = "Probability that a seed of the first scores a higher final return than one of the second, ties counted half; 0.5 is no difference."
+    picture = html.picture(
+        figures.svg(figures.improvement(found)), f"Probability of improvement: {said}."
+    )
     return html.table(tables.improvement(found)) + html.gallery([picture], note)
 
 
@@ -127,11 +160,14 @@ def _profile(content: Content) -> str:
     if not scores:
         return ""
     runs = ", ".join(
-        f"{name} {counted(sum(map(len, strata)), 'run')} of {counted(len(strata), 'task')}" for name, (_, strata) in scores.items()
+        f"{name} {counted(sum(map(len, strata)), 'run')} of {counted(len(strata), 'task')}"
+        for name, (_, strata) in scores.items()
     )
     note = f"Share of runs whose final return, over the best mean of the task, is above τ; the shade is its 95 % interval. {runs}."
     alt = f"Performance profiles of {', '.join(scores)}."
-    return html.gallery([html.picture(figures.svg(figures.performance_profile(content.groups)), alt)], note)
+    return html.gallery(
+        [html.picture(figures.svg(figures.performance_profile(content.groups)), alt)], note
+    )
 
 
 def _reach(content: Content) -> str:
@@ -142,8 +178,15 @@ def _reach(content: Content) -> str:
 def _speed(content: Content) -> str:
     pictures = []
     for task, members in content.tasks.items():
-        said = ", ".join(f"{group.name} {sum(row.samples_per_second for row in group.rows) / len(group.rows):,.0f}" for group in members)
-        pictures.append(html.picture(figures.svg(figures.speed(members)), f"Samples per second on {task}: {said}."))
+        said = ", ".join(
+            f"{group.name} {sum(row.samples_per_second for row in group.rows) / len(group.rows):,.0f}"
+            for group in members
+        )
+        pictures.append(
+            html.picture(
+                figures.svg(figures.speed(members)), f"Samples per second on {task}: {said}."
+            )
+        )
     note = "Samples per second and seconds of wall-clock time of a run; a tick per seed. Runs that share a machine slow each other down."
     return html.table(tables.speed(content.groups)) + html.gallery(pictures, note)
 
@@ -154,13 +197,19 @@ def _videos(content: Content) -> str:
         for name in (task, members[0].rows[0].env):
             path = content.study.directory / "videos" / f"{name.replace(':', '-')}.mp4"
             if path.is_file():
-                films.append(f"<div>{html.paragraph(task)}{html.video(path.read_bytes(), f'A trained policy on {task}')}</div>")
+                films.append(
+                    f"<div>{html.paragraph(task)}{html.video(path.read_bytes(), f'A trained policy on {task}')}</div>"
+                )
                 break
     return html.gallery(films, "Trained policies.") if films else ""
 
 
 def _made(content: Content) -> str:
-    return settings.cells(content.groups) + settings.commands(content.groups) + settings.provenance(content.study.rows)
+    return (
+        settings.cells(content.groups)
+        + settings.commands(content.groups)
+        + settings.provenance(content.study.rows)
+    )
 
 
 PARTS: dict[str, Callable[[Content], str]] = {

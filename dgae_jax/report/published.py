@@ -33,10 +33,18 @@ def read(path: Path = FILE) -> list[Published]:
     except OSError as reason:
         raise ConfigError(f"published: needs {path} ({reason.strerror})", "published") from reason
     except (KeyError, ValueError, TypeError) as reason:
-        raise ConfigError(f"{path}: must have the columns {', '.join(Published._fields)} with numbers in them ({reason})") from reason
+        raise ConfigError(
+            f"{path}: must have the columns {', '.join(Published._fields)} with numbers in them ({reason})"
+        ) from reason
 
 
 def _row(row: dict[str, str]) -> Published:
     spread, seeds = row["spread"], row["seeds"]
     numbers = int(row["samples"]), row["algorithm"], float(row["mean"])
-    return Published(row["task"], *numbers, float(spread) if spread else None, int(seeds) if seeds else None, row["source"])
+    return Published(
+        row["task"],
+        *numbers,
+        float(spread) if spread else None,
+        int(seeds) if seeds else None,
+        row["source"],
+    )

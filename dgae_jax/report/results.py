@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from dgae_jax.configs.algorithms import TABLE
+from dgae_jax.configs.algorithms import ALGORITHMS
 from dgae_jax.configs.config import ConfigError
 from dgae_jax.run import files, terminal
 from dgae_jax.run.summary import mean_of_worst
@@ -106,11 +106,15 @@ def read(path: Path) -> Study:
             raise ConfigError(f"{path}: must be the directory of a study; there is nothing")
         file = path / RESULTS if path.is_dir() else path
         if not file.exists() and not (path / "study.json").exists():
-            raise ConfigError(f"{path}: must be the directory of a study, with study.json and {RESULTS}")
+            raise ConfigError(
+                f"{path}: must be the directory of a study, with study.json and {RESULTS}"
+            )
         rows, diverged = _rows(file) if file.exists() else ((), ())
         planned = _planned(path / "study.json") if path.is_dir() else None
     except OSError as reason:
-        raise ConfigError(f"{path}: must be a study that can be read ({reason.strerror})") from reason
+        raise ConfigError(
+            f"{path}: must be a study that can be read ({reason.strerror})"
+        ) from reason
     if not rows:
         raise ConfigError(f"{path}: must have results; {RESULTS} has none yet")
     return Study(path, rows, planned, diverged)
@@ -132,13 +136,20 @@ def _rows(path: Path) -> tuple[tuple[Row, ...], tuple[tuple[str, int], ...]]:
     for number, (data, after) in enumerate(files.whole_rows(path), start=1):
         end = after
         if _diverged(data):
-            cell, seed = (_field(data, name, f"{path} line {number}", *FIELDS[name]) for name in ("cell", "seed"))
-            terminal.warn(f"warning: {path} line {number}: left out, because the return of cell {cell}, seed {seed} is not finite")
+            cell, seed = (
+                _field(data, name, f"{path} line {number}", *FIELDS[name])
+                for name in ("cell", "seed")
+            )
+            terminal.warn(
+                f"warning: {path} line {number}: left out, because the return of cell {cell}, seed {seed} is not finite"
+            )
             diverged.append((cell, seed))
             continue
         row = _row(data, f"{path} line {number}")
         if (row.cell, row.seed) in seen:
-            raise ConfigError(f"{path} line {number}: cell {row.cell}, seed {row.seed} is there twice")
+            raise ConfigError(
+                f"{path} line {number}: cell {row.cell}, seed {row.seed} is there twice"
+            )
         seen.add((row.cell, row.seed))
         rows.append(row)
     if b"\n" in path.read_bytes()[end:]:  # a last line without an end is still being written
@@ -166,10 +177,14 @@ def _list(test: Callable[[Any], bool]) -> Callable[[Any], bool]:
 
 _numbers = _list(_number)
 _TEXT, _TEXT_OR_NONE = (_is(str), "a string"), (_is(str, type(None)), "a string or null")
-_WHOLE, _NUMBER, _OBJECT = (_is(int), "a whole number"), (_number, "a number"), (_is(dict), "an object")
+_WHOLE, _NUMBER, _OBJECT = (
+    (_is(int), "a whole number"),
+    (_number, "a number"),
+    (_is(dict), "an object"),
+)
 
 FIELDS = {
-    "cell": _TEXT, "env": _TEXT, "env_version": _TEXT_OR_NONE, "algo": (TABLE.__contains__, f"one of {', '.join(TABLE)}"),
+    "cell": _TEXT, "env": _TEXT, "env_version": _TEXT_OR_NONE, "algo": (ALGORITHMS.__contains__, f"one of {', '.join(ALGORITHMS)}"),
     "variant": _TEXT_OR_NONE, "seed": _WHOLE, "total_steps": _WHOLE, "hash": _TEXT, "final": _OBJECT, "final.engine": _TEXT,
     "final.return_mean": _NUMBER, "final.returns": (lambda value: _numbers(value) and bool(value), "a list of numbers, one at least"),
     "best": (_is(dict, type(None)), "an object or null"), "curve": _OBJECT,
@@ -186,7 +201,11 @@ BEST = {"best.steps": _WHOLE, "best.return_mean": _NUMBER}
 
 def _row(data: dict[str, Any], where: str) -> Row:
     found = {path: _field(data, path, where, *kind) for path, kind in FIELDS.items()}
-    best = {path: _field(data, path, where, *kind) for path, kind in BEST.items()} if found["best"] else {}
+    best = (
+        {path: _field(data, path, where, *kind) for path, kind in BEST.items()}
+        if found["best"]
+        else {}
+    )
     steps, returns = np.array(found["curve.steps"], float), np.array(found["curve.return"], float)
     if len(steps) != len(returns) or (np.diff(steps) <= 0).any():
         raise ConfigError(f"{where}: curve: must have increasing steps and a return for each")

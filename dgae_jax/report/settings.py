@@ -20,7 +20,11 @@ def cells(groups: Sequence[Group]) -> str:
 def _settings(group: Group, first: Group) -> str:
     ours, theirs = (_of(each) for each in (group, first))
     rows = [(name, shown(value)) for name, value in ours.items()]
-    differ = [y for y, (name, value) in enumerate(ours.items()) if name not in theirs or theirs[name] != value]
+    differ = [
+        y
+        for y, (name, value) in enumerate(ours.items())
+        if name not in theirs or theirs[name] != value
+    ]
     seeds = ", ".join(str(row.seed) for row in group.rows)
     against = "" if group is first else f"; {len(differ)} differ from {first.name} on {first.task}"
     content = html.table(Table(("setting", "value"), rows, keys=1), {(y, 1) for y in differ})
@@ -33,7 +37,9 @@ def _of(group: Group) -> dict[str, Any]:
 
 def commands(groups: Iterable[Group]) -> str:
     """The command that made each cell."""
-    lines = [f"# {row.cell}, seed {row.seed}\n{row.command}" for group in groups for row in group.rows]
+    lines = [
+        f"# {row.cell}, seed {row.seed}\n{row.command}" for group in groups for row in group.rows
+    ]
     return html.details("The command of every cell", html.code(lines))
 
 
@@ -41,10 +47,17 @@ def provenance(rows: Iterable[Row]) -> str:
     """Versions, machines and revisions, each with the number of runs that have it."""
     facts = [fact for row in rows for fact in _facts(row)]
     counted = {fact: facts.count(fact) for fact in sorted(set(facts))}
-    table = Table(("what", "which", "runs"), [(what, which, str(count)) for (what, which), count in counted.items()])
+    table = Table(
+        ("what", "which", "runs"),
+        [(what, which, str(count)) for (what, which), count in counted.items()],
+    )
     return html.details("Versions and machines", html.table(table))
 
 
 def _facts(row: Row) -> list[tuple[str, str]]:
-    found = {"git revision": row.git_revision, **{f"machine: {name}": value for name, value in row.machine.items()}, **row.versions}
+    found = {
+        "git revision": row.git_revision,
+        **{f"machine: {name}": value for name, value in row.machine.items()},
+        **row.versions,
+    }
     return [(name, NONE if value is None else str(value)) for name, value in found.items()]

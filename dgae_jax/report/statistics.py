@@ -35,7 +35,9 @@ def improvement(better: Strata, worse: Strata) -> np.ndarray:
 
 
 def _wins(x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    rivals = np.moveaxis(y, -1, 0)[..., None]  # one after the other: all pairs of all draws would be large
+    rivals = np.moveaxis(y, -1, 0)[
+        ..., None
+    ]  # one after the other: all pairs of all draws would be large
     return np.mean([((x > rival) + 0.5 * (x == rival)).mean(-1) for rival in rivals], axis=0)
 
 
@@ -59,11 +61,19 @@ def interval(statistic: Callable[..., np.ndarray], *samples: Strata) -> np.ndarr
     if any(len(scores) < 2 for strata in samples for scores in strata):
         return None
     generator = np.random.default_rng(0)
-    drawn = [[scores[generator.integers(len(scores), size=(REPLICATES, len(scores)))] for scores in strata] for strata in samples]
+    drawn = [
+        [
+            scores[generator.integers(len(scores), size=(REPLICATES, len(scores)))]
+            for scores in strata
+        ]
+        for strata in samples
+    ]
     return np.quantile(statistic(*drawn), [(1 - LEVEL) / 2, (1 + LEVEL) / 2], axis=0)
 
 
-def common_curve(curves: Sequence[tuple[np.ndarray, np.ndarray]], points: int = 200) -> tuple[np.ndarray, np.ndarray]:
+def common_curve(
+    curves: Sequence[tuple[np.ndarray, np.ndarray]], points: int = 200
+) -> tuple[np.ndarray, np.ndarray]:
     """Curves (steps [I], values [I] with NaN where there is none) at the steps [P] that all of them cover: values [S, P].
 
     The steps are those of the curves, evenly thinned to `points`; between its own steps a curve is linear. Curves without values

@@ -5,7 +5,7 @@ The colours are those of Okabe and Ito, which people with any colour vision tell
 
 from typing import NamedTuple
 
-from dgae_jax.configs.algorithms import TABLE
+from dgae_jax.configs.algorithms import ALGORITHMS
 from dgae_jax.configs.parts import is_distribution
 
 COLOURS = {"clip": "#0072B2", "trust-region": "#D55E00", "gradient": "#009E73"}
@@ -32,8 +32,12 @@ class Look(NamedTuple):
 
 def look(algo: str, number: int = 0) -> Look:
     """Of an algorithm's first settings, or of the others by their number."""
-    row = TABLE[algo]
+    row = ALGORITHMS[algo]
     colour, several = COLOURS.get(row.policy_update, OWN), is_distribution(row.critic)
-    alike = [n for n, other in TABLE.items() if (other.policy_update, is_distribution(other.critic)) == (row.policy_update, several)]
+    alike = [
+        n
+        for n, other in ALGORITHMS.items()
+        if (other.policy_update, is_distribution(other.critic)) == (row.policy_update, several)
+    ]
     marker = MARKERS[(number + alike.index(algo)) % len(MARKERS)]
     return Look(colour, "-" if several else "--", marker, colour if several else "white")

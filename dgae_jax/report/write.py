@@ -31,7 +31,9 @@ def write(studies: Sequence[Study], out: Path, published: Sequence[Published] = 
         html = out / "report.html"
         files.replace(html, page(studies, published).encode())
     except OSError as reason:
-        raise invalid("out", out, f"a directory that can be written ({reason.strerror})") from reason
+        raise invalid(
+            "out", out, f"a directory that can be written ({reason.strerror})"
+        ) from reason
     return [*written, html]
 
 

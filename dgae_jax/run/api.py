@@ -11,11 +11,12 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from dgae_jax.configs.build import make_greedy, make_quantiles, make_task
-from dgae_jax.configs.config import Config, ConfigError, invalid, resolve
+from dgae_jax.configs.config import ConfigError, invalid
+from dgae_jax.configs.resolved import ResolvedConfig, resolve
 from dgae_jax.envs.base import Env
 from dgae_jax.envs.registry import given
-from dgae_jax.learn.types import Fitted
+from dgae_jax.learn.build import make_greedy, make_quantiles, make_task
+from dgae_jax.learn.types import InferenceState
 from dgae_jax.run import directory, loop, metrics, restore, terminal
 from dgae_jax.run.options import RunOptions
 from dgae_jax.run.training import RunError
@@ -24,12 +25,15 @@ from dgae_jax.run.training import RunError
 class Policy:
     """A trained policy: its mean action, and what its critic thinks. NumPy in and out."""
 
-    def __init__(self, policy: Fitted, critic: Fitted, config: Config):
+    def __init__(self, policy: InferenceState, critic: InferenceState, config: ResolvedConfig):
         """`policy` and `critic` of one run, without the axis of runs."""
         env = make_task(config)
         self.observation_size = int(env.observation_size)  # pyright: ignore[reportArgumentType]
         self._policy, self._critic = policy, critic
-        self._greedy, self._quantiles = jax.jit(make_greedy(env, config)), jax.jit(make_quantiles(env, config))
+        self._greedy, self._quantiles = (
+            jax.jit(make_greedy(env, config)),
+            jax.jit(make_quantiles(env, config)),
+        )
 
     def __call__(self, obs: Any) -> np.ndarray:
         """The action [..., A] in each observation [..., O]: the mean, within the actuators' range, as evaluations play it.
@@ -45,11 +49,13 @@ class Policy:
         """
         return self._each(self._quantiles, self._critic, obs)
 
-    def _each(self, function: Any, network: Fitted, obs: Any) -> np.ndarray:
+    def _each(self, function: Any, network: InferenceState, obs: Any) -> np.ndarray:
         """Leading axes are one to the compiled program, so that it is compiled again for another number of observations only."""
         obs = np.asarray(obs, np.float32)
         if obs.ndim == 0 or obs.shape[-1] != self.observation_size:
-            raise ValueError(f"observations of shape {obs.shape}; the last axis must be {self.observation_size}")
+            raise ValueError(
+                f"observations of shape {obs.shape}; the last axis must be {self.observation_size}"
+            )
         out = np.asarray(function(network, obs.reshape(-1, self.observation_size)))
         return out.reshape(*obs.shape[:-1], out.shape[-1])
 
@@ -67,7 +73,14 @@ class Run(NamedTuple):
     """The run directory, None if it was temporary."""
 
 
-def train(config: Config, run_dir: str | Path | None = None, *, env: Env | None = None, quiet: bool = False, **options: Any) -> Run:
+def train(
+    config: ResolvedConfig,
+    run_dir: str | Path | None = None,
+    *,
+    env: Env | None = None,
+    quiet: bool = False,
+    **options: Any,
+) -> Run:
     """Train, evaluate and return the whole of a run, as the command line does.
 
     `env` is an environment of one's own, which takes the place of the task that `config` names; the run is recorded as one of
@@ -83,12 +96,21 @@ def train(config: Config, run_dir: str | Path | None = None, *, env: Env | None 
     with terminal.silenced(quiet), given(env) as name, _directory(run_dir) as path:
         config = config if name is None else dataclasses.replace(config, env=name)
         chosen = RunOptions(run_dir=path, **options)
-        evaluation = (loop.go_on_or_start if chosen.resume_or_start else loop.start)(config, chosen).evaluation
-        return Run(load_policy(path, env=env), metrics.read(path / "metrics.jsonl"), evaluation, None if run_dir is None else path)
+        evaluation = (loop.go_on_or_start if chosen.resume_or_start else loop.start)(
+            config, chosen
+        ).evaluation
+        return Run(
+            load_policy(path, env=env),
+            metrics.read(path / "metrics.jsonl"),
+            evaluation,
+            None if run_dir is None else path,
+        )
 
 
-def load_policy(run_dir: str | Path, which: str = "newest", *, seed: int = 0, env: Env | None = None) -> Policy:
-    """The policy of a run's newest checkpoint, or of its best evaluation's (`which="best"`); `run_dir` may be a policy's file.
+def load_policy(
+    run_dir: str | Path, which: str = "latest", *, seed: int = 0, env: Env | None = None
+) -> Policy:
+    """The policy of a run's latest checkpoint, or of its best evaluation's (`which="best"`); `run_dir` may be a policy's file.
 
     `seed` is the index among the seeds trained side by side (`num_seeds`), `env` the object that `train` was given. Only networks and
     observation statistics are read. Raises ConfigError for an invalid argument or a directory that holds no run, CheckpointError if
@@ -101,9 +123,11 @@ def load_policy(run_dir: str | Path, which: str = "newest", *, seed: int = 0, en
         return _load(Path(run_dir), config, which, seed)
 
 
-def _load(run_dir: Path, config: Config, which: str, seed: int) -> Policy:
+def _load(run_dir: Path, config: ResolvedConfig, which: str, seed: int) -> Policy:
     if not (type(seed) is int and 0 <= seed < config.num_seeds):
-        raise ConfigError(f"seed {seed}: must be a whole number from 0 to {config.num_seeds - 1}, the index of a trained seed")
+        raise ConfigError(
+            f"seed {seed}: must be a whole number from 0 to {config.num_seeds - 1}, the index of a trained seed"
+        )
     found = restore.trained(run_dir, config, which)
     policy, critic = jax.tree.map(lambda x: x[seed], (found.policy, found.critic))
     return Policy(policy, critic, config)

@@ -7,8 +7,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from dgae_jax.configs.build import make_quantiles, make_task
-from dgae_jax.configs.config import Config
+from dgae_jax.configs.resolved import ResolvedConfig
+from dgae_jax.learn.build import make_quantiles, make_task
 from dgae_jax.learn.diagnostics import SIMILAR, similar_means
 from dgae_jax.maths.returns import bellman_target
 from dgae_jax.maths.statistics import coverage, crps, pit
@@ -25,7 +25,15 @@ BINS = 20
 """Of the histogram of the probability integral transform."""
 
 
-def calibrate(source: Path, config: Config, *, which: str, index: int = 0, seed: int = 0, watch: Watch = unwatched) -> dict[str, Any]:
+def calibrate(
+    source: Path,
+    config: ResolvedConfig,
+    *,
+    which: str,
+    index: int = 0,
+    seed: int = 0,
+    watch: Watch = unwatched,
+) -> dict[str, Any]:
     """Statistics of the critic of a run, or in a file, over the `outcomes` of `WORLDS` worlds, actions drawn from the policy.
 
     Returns are of scaled rewards, as the critic's: `coverage_90` is the share of them inside the central 90 % of the quantiles,
@@ -46,7 +54,10 @@ def calibrate(source: Path, config: Config, *, which: str, index: int = 0, seed:
 
 def statistics(quantiles: jax.Array, outcome: jax.Array) -> dict[str, Any]:
     """Of quantiles [T, N, K] and the returns [T, N] that came."""
-    error, probability = np.asarray(quantiles.mean(-1) - outcome), np.asarray(pit(quantiles, outcome))
+    error, probability = (
+        np.asarray(quantiles.mean(-1) - outcome),
+        np.asarray(pit(quantiles, outcome)),
+    )
     falls = jnp.diff(quantiles) < 0
     found = {
         "coverage_90": coverage(quantiles, outcome, 0.9),
@@ -57,11 +68,16 @@ def statistics(quantiles: jax.Array, outcome: jax.Array) -> dict[str, Any]:
         "crps": crps(quantiles, outcome).mean(),
     }
     bins = np.histogram(probability, BINS, (0, 1))[0] / probability.size
-    return {**{name: round(float(value), 6) for name, value in found.items()}, "pit": [round(float(share), 6) for share in bins]}
+    return {
+        **{name: round(float(value), 6) for name, value in found.items()},
+        "pit": [round(float(share), 6) for share in bins],
+    }
 
 
 def similar(reward: jax.Array, discount: jax.Array, quantiles: jax.Array) -> dict[str, float]:
     """By each of `SHARES`, the share of steps [T − 1, N] with |d(r + γG′, G)| ≤ share · W₁(r + γG′, G) (Sec. results)."""
     before, after = quantiles[:-1], quantiles[1:]
     target = bellman_target(reward[: len(before)], discount[: len(before)], after)
-    return {str(share): round(float(similar_means(target, before, share).mean()), 6) for share in SHARES}
+    return {
+        str(share): round(float(similar_means(target, before, share).mean()), 6) for share in SHARES
+    }

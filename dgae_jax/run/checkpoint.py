@@ -17,14 +17,19 @@ import jax.numpy as jnp
 import msgpack
 import numpy as np
 
-from dgae_jax.configs.config import Config, ConfigError
+from dgae_jax.configs.config import ConfigError
+from dgae_jax.configs.resolved import ResolvedConfig, resolve
 from dgae_jax.configs.serial import from_dict, to_dict
 from dgae_jax.run import files, hosts
 
 T = TypeVar("T")
 
-SCHEMA = 3
-"""Version of the file format. In 1 the physics `jax` was called `mjx`; up to 2 the worlds of a run drew from one key together."""
+SCHEMA = 4
+"""Version of the file format. In 1 the physics `jax` was called `mjx`; up to 2 all envs drew from
+one key."""
+
+RENAMED = {3: {"observations": "obs_stats"}}
+"""By schema: the old first part of an array's name, and the one in the next schema."""
 
 ARRAY = 1
 """Msgpack's extension type of an array: shape, name of the dtype and bytes, as Flax writes it."""
@@ -51,8 +56,15 @@ def arrays_of(tree: Any) -> dict[str, np.ndarray]:
     return {name: np.array(hosts.whole(x)) for name, x in sorted(_plain(tree).items())}
 
 
-def save(directory: Path, config: Config, arrays: dict[str, np.ndarray], steps: int, keep: int = 3, best: int | None = None) -> Path:
-    """Write `steps_….msgpack`, complete or not at all, and delete all but the newest `keep` and that of `best` steps.
+def save(
+    directory: Path,
+    config: ResolvedConfig,
+    arrays: dict[str, np.ndarray],
+    steps: int,
+    keep: int = 3,
+    best: int | None = None,
+) -> Path:
+    """Write `steps_….msgpack`, complete or not at all, and delete all but the latest `keep` and that of `best` steps.
 
     Files of more steps do not count: the run went back behind them because they were damaged. Raises NotFiniteError, and
     writes nothing, if a number is not finite.
@@ -67,10 +79,12 @@ def save(directory: Path, config: Config, arrays: dict[str, np.ndarray], steps: 
     return path
 
 
-def write(path: Path, config: Config, arrays: dict[str, np.ndarray]) -> None:
+def write(path: Path, config: ResolvedConfig, arrays: dict[str, np.ndarray]) -> None:
     """Arrays by name and the configuration that they belong to as one file, complete or not at all."""
     packed = {name: _packed(x) for name, x in arrays.items()}
-    body: bytes = msgpack.packb({"arrays": packed, "config": json.dumps(to_dict(config), allow_nan=False)})  # pyright: ignore[reportAssignmentType]
+    body: bytes = msgpack.packb(
+        {"arrays": packed, "config": json.dumps(to_dict(config), allow_nan=False)}
+    )  # pyright: ignore[reportAssignmentType]
     header = {"schema": SCHEMA, "sha256": hashlib.sha256(body).hexdigest()}
     files.replace(path, json.dumps(header, allow_nan=False).encode() + b"\n" + body)
 
@@ -86,7 +100,11 @@ def name_of(steps: int) -> str:
 
 def found(directory: Path) -> list[Path]:
     """The checkpoints in a directory, oldest first; no link is followed."""
-    named = (p for p in directory.glob("steps_*.msgpack") if re.fullmatch(r"steps_\d{12}\.msgpack", p.name))
+    named = (
+        p
+        for p in directory.glob("steps_*.msgpack")
+        if re.fullmatch(r"steps_\d{12}\.msgpack", p.name)
+    )
     return sorted(p for p in named if p.is_file() and not p.is_symlink())
 
 
@@ -96,13 +114,17 @@ def not_finite(arrays: dict[str, np.ndarray]) -> list[str]:
     Networks, optimisers and running statistics must be finite. Worlds (`episodes`) need not: the return of the last episode
     is NaN before the first, and a world may be kept for replay as it turned non-finite.
     """
-    learnt = (name for name, x in arrays.items() if jnp.issubdtype(x.dtype, jnp.inexact) and not name.startswith("episodes."))
+    learnt = (
+        name
+        for name, x in arrays.items()
+        if jnp.issubdtype(x.dtype, jnp.inexact) and not name.startswith("episodes.")
+    )
     return [name for name in learnt if not np.isfinite(arrays[name]).all()]
 
 
-def config_of(path: Path) -> Config:
+def config_of(path: Path) -> ResolvedConfig:
     """The configuration in a checkpoint; raises as `load`."""
-    with _body(path) as (file, size), _decoding(path):
+    with _body(path) as (file, size, _), _decoding(path):
         unpacker = msgpack.Unpacker(file, max_buffer_size=size)
         if (unpacker.read_map_header(), unpacker.unpack()) != (2, "arrays"):
             raise ValueError
@@ -111,7 +133,7 @@ def config_of(path: Path) -> Config:
             raise ValueError
         text = unpacker.unpack()
     try:
-        return from_dict(json.loads(text))
+        return resolve(from_dict(json.loads(text)))
     except ConfigError as reason:
         raise CheckpointError(f"{path}: is of another version ({reason})") from reason
     except (ValueError, TypeError, RecursionError) as reason:
@@ -126,12 +148,14 @@ def load(path: Path, like: T, *, part: bool = False) -> T:
     holds NaN or infinity where `not_finite` says that it must not.
     """
     want = jax.eval_shape(_plain, like)
-    with _body(path) as (file, size):
-        got = dict(_arrays(path, file, size, want, part))
+    with _body(path) as (file, size, schema):
+        got = dict(_arrays(path, file, size, schema, want, part))
     for name in sorted(set(want) - set(got)):
         raise MissingError(f"{path}: is of another run, {name} is missing")
     for name in not_finite(got):
-        raise NotFiniteError(f"{path}: {name} is not finite: it can be neither continued nor evaluated")
+        raise NotFiniteError(
+            f"{path}: {name} is not finite: it can be neither continued nor evaluated"
+        )
 
     def restored(at, like):
         leaf = jnp.asarray(got[_name(at)])
@@ -140,7 +164,9 @@ def load(path: Path, like: T, *, part: bool = False) -> T:
     return jax.tree.map_with_path(restored, like)
 
 
-def _arrays(path: Path, file: BinaryIO, size: int, want: dict[str, Any], part: bool) -> Iterator[tuple[str, np.ndarray]]:
+def _arrays(
+    path: Path, file: BinaryIO, size: int, schema: int, want: dict[str, Any], part: bool
+) -> Iterator[tuple[str, np.ndarray]]:
     """Arrays by name. Containers and whatever is not expected are refused before they take memory."""
     with _decoding(path):
         unpacker = msgpack.Unpacker(file, max_buffer_size=size, max_array_len=0, max_map_len=0)
@@ -152,6 +178,7 @@ def _arrays(path: Path, file: BinaryIO, size: int, want: dict[str, Any], part: b
             name = unpacker.unpack()
             if not isinstance(name, str):
                 raise ValueError
+            name = _upgraded(name, schema)
             if name not in want and part:
                 unpacker.skip()
                 continue
@@ -175,29 +202,39 @@ def _array(path: Path, name: str, packed: bytes, like: Any) -> np.ndarray:
         if not all(type(n) is int for n in shape) or not isinstance(dtype, str):
             raise ValueError
     if (shape, dtype) != (like.shape, like.dtype.name):
-        raise CheckpointError(f"{path}: is of another run, {name} is {dtype[:20]}{shape}, here {like.dtype}{like.shape}")
+        raise CheckpointError(
+            f"{path}: is of another run, {name} is {dtype[:20]}{shape}, here {like.dtype}{like.shape}"
+        )
     with _decoding(path):
         return np.frombuffer(unpacker.unpack(), like.dtype).reshape(like.shape)
 
 
 @contextmanager
-def _body(path: Path) -> Iterator[tuple[BinaryIO, int]]:
-    """The file behind its header, and its size, if schema and checksum are right."""
+def _body(path: Path) -> Iterator[tuple[BinaryIO, int, int]]:
+    """Check the header and the checksum; the file behind the header, its size and its schema."""
     try:
         with path.open("rb") as file:
-            checksum = _header(path, file.readline(4096))
+            schema, checksum = _header(path, file.readline(4096))
             start = file.tell()
             if hashlib.file_digest(file, "sha256").hexdigest() != checksum:  # pyright: ignore[reportArgumentType]
                 raise DamagedError(f"{path}: is damaged (its checksum differs)")
             size = file.tell()
             file.seek(start)
-            yield file, size
+            yield file, size, schema
     except OSError as reason:
         raise DamagedError(f"{path}: cannot be read ({reason.strerror})") from reason
 
 
-def _header(path: Path, line: bytes) -> str:
-    """The checksum."""
+def _upgraded(name: str, schema: int) -> str:
+    """Return today's name of an array."""
+    first, dot, rest = name.partition(".")
+    for version in range(schema, SCHEMA):
+        first = RENAMED[version].get(first, first)
+    return first + dot + rest
+
+
+def _header(path: Path, line: bytes) -> tuple[int, str]:
+    """Return the schema and the checksum."""
     try:
         header = json.loads(line)
         schema, checksum = header["schema"], header["sha256"]
@@ -205,13 +242,21 @@ def _header(path: Path, line: bytes) -> str:
         raise DamagedError(f"{path}: is damaged (no header)") from None
     if type(schema) is not int:
         raise DamagedError(f"{path}: is damaged (no schema)")
-    if schema < SCHEMA:
-        why = "what it calls physics mjx is now called jax" if schema < 2 else "its worlds drew random numbers in another way"
+    if schema < min(RENAMED):
+        why = (
+            "what it calls physics mjx is now called jax"
+            if schema < 2
+            else "its worlds drew random numbers in another way"
+        )
         way = "continue it with the version that wrote it, or train again"
-        raise CheckpointError(f"{path}: has schema {schema}, this version reads schema {SCHEMA}: {why}; {way}")
+        raise CheckpointError(
+            f"{path}: has schema {schema}, this version reads schema {SCHEMA}: {why}; {way}"
+        )
     if schema > SCHEMA:
-        raise CheckpointError(f"{path}: has schema {schema}, of a newer version; this version reads schema {SCHEMA}")
-    return checksum
+        raise CheckpointError(
+            f"{path}: has schema {schema}, of a newer version; this version reads schema {SCHEMA}"
+        )
+    return schema, checksum
 
 
 @contextmanager
@@ -231,7 +276,10 @@ def _is_key(x: Any) -> bool:
 
 def _plain(tree: Any) -> dict[str, Any]:
     """The tree's arrays by name; keys as the numbers they are made of."""
-    return {_name(path): jax.random.key_data(x) if _is_key(x) else x for path, x in jax.tree.leaves_with_path(tree)}
+    return {
+        _name(path): jax.random.key_data(x) if _is_key(x) else x
+        for path, x in jax.tree.leaves_with_path(tree)
+    }
 
 
 def _name(path) -> str:

@@ -19,7 +19,9 @@ def unwatched(_: str) -> None:
     """Tell nobody."""
 
 
-def compile_aside(program: Any, *args: Any, watch: Watch = unwatched, what: str = "compiling") -> None:
+def compile_aside(
+    program: Any, *args: Any, watch: Watch = unwatched, what: str = "compiling"
+) -> None:
     """Compile a jitted function for such arguments, so that calling it does not; in a thread, while this one waits.
 
     Python runs no signal handler as long as its main thread is inside of XLA. An exception that `watch` raises leaves the

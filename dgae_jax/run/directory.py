@@ -17,9 +17,9 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import IO
 
-from dgae_jax.configs.config import Config, ConfigError, invalid
+from dgae_jax.configs.config import ConfigError, invalid
+from dgae_jax.configs.resolved import ResolvedConfig, resolve
 from dgae_jax.configs.serial import from_dict, to_dict
-from dgae_jax.configs.validation import validate
 from dgae_jax.run import files, manifest, terminal
 from dgae_jax.run.options import RunOptions
 
@@ -28,12 +28,15 @@ class InUseError(ConfigError):
     """A run directory in which another process trains."""
 
 
-def default_path(config: Config) -> Path:
+def default_path(config: ResolvedConfig) -> Path:
     """runs/ENV-ALGO-SEED-TIME below the working directory."""
-    return Path("runs") / f"{config.env.replace('/', '_')}-{config.algo}-{config.seed}-{time.strftime('%Y%m%d-%H%M%S')}"
+    return (
+        Path("runs")
+        / f"{config.env.replace('/', '_')}-{config.algo}-{config.seed}-{time.strftime('%Y%m%d-%H%M%S')}"
+    )
 
 
-def create(path: Path, config: Config, options: RunOptions) -> None:
+def create(path: Path, config: ResolvedConfig, options: RunOptions) -> None:
     """Make a new run directory, whole at once, and write what the run is.
 
     It is built beside, hidden, and moved to its place in one step; what earlier attempts that were killed left there is removed.
@@ -53,7 +56,9 @@ def create(path: Path, config: Config, options: RunOptions) -> None:
             _move(sibling, path)
         files.sync_directory(path.parent)
     except OSError as reason:
-        raise invalid("run_dir", path, f"a directory that can be written ({reason.strerror})") from reason
+        raise invalid(
+            "run_dir", path, f"a directory that can be written ({reason.strerror})"
+        ) from reason
 
 
 def _used(path: Path) -> ConfigError:
@@ -81,12 +86,17 @@ def _is_empty(path: Path) -> bool:
     """Whether there is nothing but what `_fill` leaves when it is killed."""
     return path.is_dir() and all(
         each.name in ("manifest.json", "manifest.json.part", "config.json.part")
-        or (each.name == "checkpoints" and each.is_dir() and not each.is_symlink() and not any(each.iterdir()))
+        or (
+            each.name == "checkpoints"
+            and each.is_dir()
+            and not each.is_symlink()
+            and not any(each.iterdir())
+        )
         for each in path.iterdir()
     )
 
 
-def _fill(path: Path, config: Config, options: RunOptions) -> None:
+def _fill(path: Path, config: ResolvedConfig, options: RunOptions) -> None:
     (path / "checkpoints").mkdir(exist_ok=True)
     manifest.write(path, options)
     write_config(path, config)
@@ -135,7 +145,9 @@ def locked(path: Path) -> Iterator[None]:
     try:
         file = (path / "metrics.jsonl").open("a")
     except OSError as reason:
-        raise ConfigError(f"{path}: must be a directory that can be written ({reason.strerror})") from reason
+        raise ConfigError(
+            f"{path}: must be a directory that can be written ({reason.strerror})"
+        ) from reason
     with file:
         hold(file, InUseError(f"{path}: must not be in use; another process is training there"))
         yield
@@ -148,10 +160,12 @@ def hold(file: IO, in_use: ConfigError) -> None:
     except BlockingIOError:
         raise in_use from None
     except OSError as reason:  # some network file systems have no locks
-        terminal.warn(f"warning: {file.name} cannot be locked ({reason.strerror}): train in it with one process only")
+        terminal.warn(
+            f"warning: {file.name} cannot be locked ({reason.strerror}): train in it with one process only"
+        )
 
 
-def config_of(source: Path) -> Config:
+def config_of(source: Path) -> ResolvedConfig:
     """The configuration of a run directory, or of the file of a policy; raises ConfigError if it is neither.
 
     JAX is loaded for a file only, and MuJoCo never, which a film must do without until its OpenGL is chosen.
@@ -167,16 +181,26 @@ def _kind(path: Path, test: Callable[[Path], bool]) -> bool:
     try:
         return test(path)
     except OSError as reason:
-        raise ConfigError(f"{path}: must be a run directory, or the file of a policy ({reason.strerror})") from reason
+        raise ConfigError(
+            f"{path}: must be a run directory, or the file of a policy ({reason.strerror})"
+        ) from reason
 
 
-def read_config(path: Path) -> Config:
+def read_config(path: Path) -> ResolvedConfig:
     """The configuration of a run; raises ConfigError if `path` is not a run directory, or one with links or devices in it."""
     if not _kind(path, Path.is_dir):
-        raise ConfigError(f"{path}: must be a run directory; there is {'a file' if path.exists() else 'nothing'} of that name")
+        raise ConfigError(
+            f"{path}: must be a run directory; there is {'a file' if path.exists() else 'nothing'} of that name"
+        )
     for name in ("checkpoints", "nonfinite", "tensorboard", "wandb", "mlflow"):
         _check_own(path / name, "directory", stat.S_ISDIR)
-    for name in ("config.json", "manifest.json", "metrics.jsonl", "evaluations.jsonl", "sinks.json"):
+    for name in (
+        "config.json",
+        "manifest.json",
+        "metrics.jsonl",
+        "evaluations.jsonl",
+        "sinks.json",
+    ):
         _check_own(path / name, "file", stat.S_ISREG)
     with contextlib.suppress(OSError):  # what cannot be read is missed below
         for file in path.glob("checkpoints/steps_*.msgpack"):
@@ -187,23 +211,25 @@ def read_config(path: Path) -> Config:
 def _check_own(part: Path, kind: str, is_kind: Callable[[int], bool]) -> None:
     with contextlib.suppress(OSError):  # what is missing is missed by those who need it
         if not is_kind(part.lstat().st_mode):
-            raise ConfigError(f"{part}: must be a {kind} in the run directory itself, not a link or anything else")
+            raise ConfigError(
+                f"{part}: must be a {kind} in the run directory itself, not a link or anything else"
+            )
 
 
-def read_config_file(path: Path) -> Config:
+def read_config_file(path: Path) -> ResolvedConfig:
     """A configuration as JSON; raises ConfigError if it cannot be read or is invalid."""
     try:
         data = path.read_bytes()
     except (OSError, ValueError) as reason:
-        raise ConfigError(f"{path}: must be a configuration that can be read ({getattr(reason, 'strerror', reason)})") from reason
+        raise ConfigError(
+            f"{path}: must be a configuration that can be read ({getattr(reason, 'strerror', reason)})"
+        ) from reason
     try:
-        config = from_dict(json.loads(data))
-        validate(config)
-        return config
+        return resolve(from_dict(json.loads(data)))
     except (ValueError, RecursionError) as reason:
         raise ConfigError(f"{path}: {reason}") from reason
 
 
-def write_config(path: Path, config: Config) -> None:
+def write_config(path: Path, config: ResolvedConfig) -> None:
     """`config.json` of the run directory `path`."""
     files.write_json(path / "config.json", to_dict(config))

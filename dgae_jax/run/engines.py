@@ -1,16 +1,17 @@
 """Where a policy can be evaluated."""
 
-from dgae_jax.configs.config import Config, invalid
+from dgae_jax.configs.config import invalid
+from dgae_jax.configs.resolved import ResolvedConfig
 from dgae_jax.envs.registry import spec_of
 
 
-def engines_of(config: Config) -> tuple[str, ...]:
+def engines_of(config: ResolvedConfig) -> tuple[str, ...]:
     """Where a run can be evaluated, the referee first: Gymnasium for our tasks and its own, the run's own physics for any other."""
     spec = spec_of(config.env)
     return ("gymnasium", *spec.engines) if spec.referees else spec.engines
 
 
-def engine_of(config: Config, engine: str | None, setting: str = "engine") -> str:
+def engine_of(config: ResolvedConfig, engine: str | None, setting: str = "engine") -> str:
     """The engine of that name, the first of `engines_of` where there is none; raises ConfigError if the run cannot have it.
 
     `setting` is what the name was given as.
@@ -20,6 +21,6 @@ def engine_of(config: Config, engine: str | None, setting: str = "engine") -> st
     return engine or engines_of(config)[0]
 
 
-def referee(config: Config) -> str:
+def referee(config: ResolvedConfig) -> str:
     """Gymnasium's name of the task, or ours where Gymnasium does not play it."""
     return spec_of(config.env).referee(config.env_version) or config.env

@@ -11,12 +11,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from dgae_jax.configs.build import make_greedy, make_task, make_trainer
-from dgae_jax.configs.config import Config
+from dgae_jax.configs.resolved import ResolvedConfig
 from dgae_jax.envs.registry import GIVEN, spec_of
 from dgae_jax.learn import play
+from dgae_jax.learn.build import make_greedy, make_task, make_trainer
 from dgae_jax.learn.parallel import Trainer
-from dgae_jax.learn.types import Fitted
+from dgae_jax.learn.types import InferenceState
 from dgae_jax.run import files, restore
 from dgae_jax.run.compiling import Watch, compile_aside, unwatched
 from dgae_jax.run.engines import engine_of, referee
@@ -26,7 +26,7 @@ CHUNK = 50
 """Steps between looks at signals and clock."""
 
 
-def time_limit(config: Config) -> int:
+def time_limit(config: ResolvedConfig) -> int:
     """Steps of the longest episode: the run's own limit, or that of a task of Gymnasium's if it is shorter."""
     gymnasium_id = spec_of(config.env).gymnasium_id
     if gymnasium_id is None:
@@ -39,41 +39,62 @@ def time_limit(config: Config) -> int:
     return min(config.episode_length, own or config.episode_length)
 
 
-def make_referee(config: Config) -> Any:
+def make_referee(config: ResolvedConfig) -> Any:
     """A world of the task in Gymnasium, with the time limit that episodes in training have."""
     import gymnasium  # here, so that training alone does not import it
 
     if spec_of(config.env).gymnasium_id is None:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # that v4 is not the newest version is known
+            warnings.simplefilter("ignore")  # that v4 is not the latest version is known
             return gymnasium.make(referee(config), max_episode_steps=config.episode_length)
     from dgae_jax.envs.gymnasium import make_world
 
-    return gymnasium.wrappers.TimeLimit(make_world(referee(config)), config.episode_length)  # beside the task's own
+    return gymnasium.wrappers.TimeLimit(
+        make_world(referee(config)), config.episode_length
+    )  # beside the task's own
 
 
 def default_path(source: Path, engine: str, which: str) -> Path:
     """The file of an evaluation after training, one for each engine and choice of checkpoint; beside a policy's own file."""
-    return files.beside(source, f"evaluation-{engine}{'' if which == 'newest' else f'-{which}'}.json")
+    return files.beside(
+        source, f"evaluation-{engine}{'' if which == 'latest' else f'-{which}'}.json"
+    )
 
 
 def episode_seeds(seed: int, episodes: int) -> np.ndarray:
     """A number of 64 bits for each initial state [E]; no other `seed` has any of them, but by a chance of 2⁻⁶⁴ per pair."""
-    return np.array([np.random.SeedSequence((seed, i)).generate_state(1, np.uint64)[0] for i in range(episodes)])
+    return np.array(
+        [np.random.SeedSequence((seed, i)).generate_state(1, np.uint64)[0] for i in range(episodes)]
+    )
 
 
 def evaluate_run(
-    run_dir: Path, config: Config, *, which: str, engine: str | None = None, episodes: int, seed: int = 0, watch: Watch = unwatched
+    run_dir: Path,
+    config: ResolvedConfig,
+    *,
+    which: str,
+    engine: str | None = None,
+    episodes: int,
+    seed: int = 0,
+    watch: Watch = unwatched,
 ) -> dict[str, Any]:
-    """`evaluate_policies` for a run's newest checkpoint or the best of its evaluations; raises as it and `restore.trained`."""
+    """`evaluate_policies` for a run's latest checkpoint or the best of its evaluations; raises as it and `restore.trained`."""
     engine = engine_of(config, engine)
     found = restore.trained(run_dir, config, which)
-    result = evaluate_policies(found.policy, config, engine=engine, episodes=episodes, seed=seed, watch=watch)
+    result = evaluate_policies(
+        found.policy, config, engine=engine, episodes=episodes, seed=seed, watch=watch
+    )
     return {**result, "checkpoint": found.path.name}
 
 
 def evaluate_policies(
-    policies: Fitted, config: Config, *, engine: str | None = None, episodes: int, seed: int = 0, watch: Watch = unwatched
+    policies: InferenceState,
+    config: ResolvedConfig,
+    *,
+    engine: str | None = None,
+    episodes: int,
+    seed: int = 0,
+    watch: Watch = unwatched,
 ) -> dict[str, Any]:
     """Undiscounted returns of the policies of a run, one per trained seed: `returns` are all of them, `seeds` each one's.
 
@@ -86,7 +107,11 @@ def evaluate_policies(
     for i in range(config.num_seeds):
         of = f", seed {config.seed + i}" if config.num_seeds > 1 else ""
         one = jax.tree.map(lambda x, i=i: x[i], policies)
-        progress = _Progress(watch, f"evaluating {counted(episodes, 'episode')} in {where}{of}", config.episode_length)
+        progress = _Progress(
+            watch,
+            f"evaluating {counted(episodes, 'episode')} in {where}{of}",
+            config.episode_length,
+        )
         per_run.append(run(one, config, engine, episodes, seed, progress))
     return {
         "engine": engine,
@@ -94,7 +119,9 @@ def evaluate_policies(
         "episodes": episodes * config.num_seeds,
         **summary(np.concatenate(per_run)),
         **(over_seeds(per_run) if len(per_run) > 1 else {}),
-        "seeds": [{"seed": config.seed + i, **summary(returns)} for i, returns in enumerate(per_run)],
+        "seeds": [
+            {"seed": config.seed + i, **summary(returns)} for i, returns in enumerate(per_run)
+        ],
     }
 
 
@@ -110,16 +137,20 @@ class _Progress(NamedTuple):
 
 
 @lru_cache(maxsize=1)
-def _programs(config: Config, given: Any) -> tuple[Trainer, Callable[[Fitted, play.Play, int], play.Play]]:
+def _programs(
+    config: ResolvedConfig, given: Any
+) -> tuple[Trainer, Callable[[InferenceState, play.Play, int], play.Play]]:
     """In the physics of `config`, for the object that its task's name stands for now, if it does for one: the trainer, and
     `go_on(policy, episodes, until) -> episodes`.
     """
     env = make_task(config)
     greedy = make_greedy(env, config)
-    return make_trainer(env, 1), jax.jit(lambda policy, now, until: play.play(env, lambda obs: greedy(policy, obs), now, until))
+    return make_trainer(env, 1), jax.jit(
+        lambda policy, now, until: play.play(env, lambda obs: greedy(policy, obs), now, until)
+    )
 
 
-def _fresh_worlds(config: Config, seed: int, episodes: int, progress: _Progress) -> Any:
+def _fresh_worlds(config: ResolvedConfig, seed: int, episodes: int, progress: _Progress) -> Any:
     """Environment states at the beginning of an episode [E].
 
     They are taken from fresh training states: a reset of Brax's takes half a minute to compile, and JAX's cache already has
@@ -127,17 +158,39 @@ def _fresh_worlds(config: Config, seed: int, episodes: int, progress: _Progress)
     """
     init = _programs(config, GIVEN.get(config.env))[0].init
     batches = -(-episodes // (config.num_seeds * config.num_envs))
-    numbers = [np.random.SeedSequence((seed, i)).generate_state(config.num_seeds) for i in range(batches)]
+    numbers = [
+        np.random.SeedSequence((seed, i)).generate_state(config.num_seeds) for i in range(batches)
+    ]
     keys = [jnp.stack([jax.random.key(int(n)) for n in each]) for each in numbers]
-    compile_aside(init, config, keys[0], watch=progress.watch, what=f"{progress.what}: compiling resets")
-    worlds = [jax.tree.map(lambda x: x.reshape(x.shape[0] * x.shape[1], *x.shape[2:]), init(config, each).episodes.env) for each in keys]
+    compile_aside(
+        init, config, keys[0], watch=progress.watch, what=f"{progress.what}: compiling resets"
+    )
+    worlds = [
+        jax.tree.map(
+            lambda x: x.reshape(x.shape[0] * x.shape[1], *x.shape[2:]),
+            init(config, each).episodes.env,
+        )
+        for each in keys
+    ]
     return jax.tree.map(lambda *parts: jnp.concatenate(parts)[:episodes], *worlds)
 
 
-def _in_jax(policy: Fitted, config: Config, engine: str, episodes: int, seed: int, progress: _Progress) -> np.ndarray:
+def _in_jax(
+    policy: InferenceState,
+    config: ResolvedConfig,
+    engine: str,
+    episodes: int,
+    seed: int,
+    progress: _Progress,
+) -> np.ndarray:
     config = dataclasses.replace(config, physics=engine)
-    now, go_on = play.begin(_fresh_worlds(config, seed, episodes, progress)), _programs(config, GIVEN.get(config.env))[1]
-    compile_aside(go_on, policy, now, 1, watch=progress.watch, what=f"{progress.what}: compiling steps")
+    now, go_on = (
+        play.begin(_fresh_worlds(config, seed, episodes, progress)),
+        _programs(config, GIVEN.get(config.env))[1],
+    )
+    compile_aside(
+        go_on, policy, now, 1, watch=progress.watch, what=f"{progress.what}: compiling steps"
+    )
     while (step := int(now.step)) < config.episode_length and (alive := int(now.alive.sum())):
         progress(step, alive)
         now = go_on(policy, now, min(step + CHUNK, config.episode_length))
@@ -145,17 +198,30 @@ def _in_jax(policy: Fitted, config: Config, engine: str, episodes: int, seed: in
 
 
 @lru_cache(maxsize=1)
-def _greedy(config: Config, given: Any):
+def _greedy(config: ResolvedConfig, given: Any):
     return jax.jit(make_greedy(make_task(config), config))
 
 
-def _in_gymnasium(policy: Fitted, config: Config, engine: str, episodes: int, seed: int, progress: _Progress) -> np.ndarray:
+def _in_gymnasium(
+    policy: InferenceState,
+    config: ResolvedConfig,
+    engine: str,
+    episodes: int,
+    seed: int,
+    progress: _Progress,
+) -> np.ndarray:
     """Gymnasium's own task in C MuJoCo, the referee: episodes side by side, one batched policy call per step."""
     worlds = [make_referee(config) for _ in range(episodes)]
     greedy = _greedy(config, GIVEN.get(config.env))
     starts = zip(episode_seeds(seed, episodes), worlds, strict=True)
     obs = np.stack([world.reset(seed=int(number))[0] for number, world in starts])
-    compile_aside(greedy, policy, obs.astype(np.float32), watch=progress.watch, what=f"{progress.what}: compiling")
+    compile_aside(
+        greedy,
+        policy,
+        obs.astype(np.float32),
+        watch=progress.watch,
+        what=f"{progress.what}: compiling",
+    )
     total, alive, step = np.zeros(episodes), np.full(episodes, True), 0
     while alive.any():
         if step % CHUNK == 0:

@@ -23,19 +23,28 @@ from dgae_jax.run.options import RunOptions
 
 def join(options: RunOptions) -> None:
     """Meet the other processes of the run, if there are any; raises ConfigError if they do not come."""
-    if jax.distributed.is_initialized() or options.num_processes == 1 or not (options.coordinator or _detected()):
+    if (
+        jax.distributed.is_initialized()
+        or options.num_processes == 1
+        or not (options.coordinator or _detected())
+    ):
         return
     try:
         jax.distributed.initialize(options.coordinator, options.num_processes, options.process_id)
     except (RuntimeError, ValueError) as reason:
         where = options.coordinator or "found by JAX"
         why = str(reason).partition("\n")[0][:300]
-        raise ConfigError(f"coordinator {where}: must be where all processes of the run meet ({why})", "coordinator") from reason
+        raise ConfigError(
+            f"coordinator {where}: must be where all processes of the run meet ({why})",
+            "coordinator",
+        ) from reason
 
 
 def _detected() -> bool:
     """Whether a scheduler started several processes of this program: Slurm, Open MPI, Kubernetes (an indexed job) or a TPU pod."""
-    several = any(int(os.environ.get(name) or 1) > 1 for name in ("SLURM_NTASKS", "OMPI_COMM_WORLD_SIZE"))
+    several = any(
+        int(os.environ.get(name) or 1) > 1 for name in ("SLURM_NTASKS", "OMPI_COMM_WORLD_SIZE")
+    )
     pod = "," in os.environ.get("TPU_WORKER_HOSTNAMES", "")
     return several or pod or {"KUBERNETES_SERVICE_HOST", "JOB_COMPLETION_INDEX"} <= set(os.environ)
 

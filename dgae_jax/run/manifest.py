@@ -13,7 +13,19 @@ from typing import Any
 from dgae_jax.run import files
 from dgae_jax.run.options import RunOptions, from_dict, to_dict
 
-_VERSIONS_OF = ("dgae_jax", "jax", "jaxlib", "flax", "optax", "brax", "mujoco", "mujoco-mjx", "playground", "gymnasium", "numpy")
+_VERSIONS_OF = (
+    "dgae_jax",
+    "jax",
+    "jaxlib",
+    "flax",
+    "optax",
+    "brax",
+    "mujoco",
+    "mujoco-mjx",
+    "playground",
+    "gymnasium",
+    "numpy",
+)
 
 
 def write(run_dir: Path, options: RunOptions) -> None:
@@ -36,7 +48,11 @@ def options(run_dir: Path) -> RunOptions:
 def changes(run_dir: Path, options: RunOptions) -> list[str]:
     """What decides the bits of a result and is not what it was in the last part of the run."""
     was, now = _deciding(last(run_dir)), _deciding(_now(options))
-    return [f"{name} {value} (was {was.get(name)})" for name, value in now.items() if was.get(name) != value]
+    return [
+        f"{name} {value} (was {was.get(name)})"
+        for name, value in now.items()
+        if was.get(name) != value
+    ]
 
 
 def _deciding(part: dict[str, Any]) -> dict[str, Any]:
@@ -99,11 +115,22 @@ def _git_revision() -> str | None:
     """
 
     def git(*words: str) -> str:
-        done = subprocess.run(["git", *words], cwd=Path(__file__).parent, capture_output=True, text=True, check=True, timeout=60)
+        done = subprocess.run(
+            ["git", *words],
+            cwd=Path(__file__).parent,
+            capture_output=True,
+            text=True,
+            check=True,
+            timeout=60,
+        )
         return done.stdout.strip()
 
     try:
-        git("ls-files", "--error-unmatch", Path(__file__).name)  # a repository around an installed package is another one
-        return git("rev-parse", "HEAD") + ("+" if git("status", "--porcelain", "--untracked-files=no") else "")
+        git(
+            "ls-files", "--error-unmatch", Path(__file__).name
+        )  # a repository around an installed package is another one
+        return git("rev-parse", "HEAD") + (
+            "+" if git("status", "--porcelain", "--untracked-files=no") else ""
+        )
     except (OSError, subprocess.SubprocessError):
         return None

@@ -40,7 +40,9 @@ class Page:
         if began < self.due and not at_once:
             return
         figure = self.draw()
-        self._put({"text/plain": words}, {}) if figure is None else self._put(*_picture(figure, words))
+        self._put({"text/plain": words}, {}) if figure is None else self._put(
+            *_picture(figure, words)
+        )
         ended = time.monotonic()
         self.due = ended + max(EVERY, 9 * (ended - began))
 
@@ -63,4 +65,6 @@ def _picture(figure: "Figure", words: str) -> tuple[dict[str, Any], dict[str, An
     figure.savefig(image, format="png")
     gc.collect()  # see record._plot
     png = base64.b64encode(image.getvalue()).decode()
-    return {"image/png": png, "text/plain": f"{title} {words}".strip()}, {"image/png": {"width": WIDTH}}
+    return {"image/png": png, "text/plain": f"{title} {words}".strip()}, {
+        "image/png": {"width": WIDTH}
+    }

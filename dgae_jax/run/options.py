@@ -6,7 +6,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from dgae_jax.configs.config import Config, ConfigError, invalid
+from dgae_jax.configs.config import ConfigError, invalid
+from dgae_jax.configs.resolved import ResolvedConfig
 from dgae_jax.run.engines import engine_of
 
 SINKS = {"tensorboard": "tensorboardX", "wandb": "wandb", "mlflow": "mlflow"}
@@ -24,7 +25,7 @@ class RunOptions:
     checkpoint_every: int = 200_000
     """Samples of each run between checkpoints, which are evaluated too; one is always saved at the end [environment steps]."""
     keep_checkpoints: int = 3
-    """The newest checkpoints that are kept, beside the one with the best evaluation [files]."""
+    """The latest checkpoints that are kept, beside the one with the best evaluation [files]."""
     devices: int | None = None
     """Devices of each process that share the run, which divide its worlds or its seeds; by default all, and of a CPU's cores as
     many as have 16 worlds each [devices]."""
@@ -69,7 +70,7 @@ WHOLE = {
 """Whole numbers: from, to, and why not more."""
 
 
-def validate_options(options: RunOptions, config: Config) -> None:
+def validate_options(options: RunOptions, config: ResolvedConfig) -> None:
     """Raise `ConfigError` for the first option that is invalid, in a run of `config`."""
     engine_of(config, options.eval_engine, "eval_engine")
     for name, (low, high, reason) in WHOLE.items():
@@ -87,7 +88,9 @@ def validate_options(options: RunOptions, config: Config) -> None:
         name = "num_processes" if options.process_id is None else "process_id"
         raise invalid(name, getattr(options, name), "left out without --coordinator")
     if options.process_id is not None and options.process_id >= (options.num_processes or 0):
-        raise invalid("process_id", options.process_id, f"below --num-processes {options.num_processes}")
+        raise invalid(
+            "process_id", options.process_id, f"below --num-processes {options.num_processes}"
+        )
     if options.resume is not None and options.run_dir is not None:
         raise invalid("run_dir", options.run_dir, f"left out: --resume writes to {options.resume}")
     if options.resume is not None and options.resume_or_start:
@@ -105,11 +108,24 @@ def _validate_log(names: tuple[str, ...]) -> None:
         if names.count(name) > 1:
             raise invalid("log", names, "each viewer once")
         spec = importlib.util.find_spec(SINKS[name])
-        if spec is None or spec.origin is None:  # a folder of that name in the working directory, such as Weights & Biases leaves
-            raise ConfigError(f'log {name}: {SINKS[name]} is missing; pip install "dgae_jax[{name}]"', "log")
+        if (
+            spec is None or spec.origin is None
+        ):  # a folder of that name in the working directory, such as Weights & Biases leaves
+            raise ConfigError(
+                f'log {name}: {SINKS[name]} is missing; pip install "dgae_jax[{name}]"', "log"
+            )
 
 
-_KEPT = ("devices", "checkpoint_every", "keep_checkpoints", "max_nonfinite", "eval_engine", "episodes", "debug_nonfinite", "log")
+_KEPT = (
+    "devices",
+    "checkpoint_every",
+    "keep_checkpoints",
+    "max_nonfinite",
+    "eval_engine",
+    "episodes",
+    "debug_nonfinite",
+    "log",
+)
 """What a run goes on with when it is resumed."""
 
 
@@ -122,6 +138,8 @@ def from_dict(data: Any) -> RunOptions:
     """What `to_dict` wrote; defaults for all else."""
     found = data if isinstance(data, dict) else {}
     usual = to_dict(RunOptions(devices=1, eval_engine=""))
-    kept: dict[str, Any] = {name: found[name] for name in _KEPT if type(found.get(name)) is type(usual[name])}
+    kept: dict[str, Any] = {
+        name: found[name] for name in _KEPT if type(found.get(name)) is type(usual[name])
+    }
     viewers: dict[str, Any] = {"log": [name for name in SINKS if name in kept.get("log", [])]}
     return RunOptions(**kept | viewers)

@@ -23,7 +23,12 @@ class Reporter:
         self.bar = None
         if terminal.is_live():
             console = Console(file=terminal.Steady(sys.stdout))
-            self.bar = Progress(BarColumn(None), TextColumn("{task.description}"), console=console, transient=not total)
+            self.bar = Progress(
+                BarColumn(None),
+                TextColumn("{task.description}"),
+                console=console,
+                transient=not total,
+            )
             self.task = self.bar.add_task("", total=total or None)
 
     def __enter__(self) -> "Reporter":
@@ -52,7 +57,9 @@ class Reporter:
         """`speed` in samples of one run per second; returns may not exist yet."""
         left = (self.total - steps) / speed
         shown = "–" if mean_return is None else f"{mean_return:,.1f}"
-        done = f"{steps:,}/{self.total:,}" if self.bar else f"{steps:,} of {self.total:,} steps"  # 2,147,483,647 fit 80 columns
+        done = (
+            f"{steps:,}/{self.total:,}" if self.bar else f"{steps:,} of {self.total:,} steps"
+        )  # 2,147,483,647 fit 80 columns
         text = f"{done}  {speed * self.runs:,.0f} steps/s  return {shown}  {clock(left)} left"
         if self.bar:
             self.bar.update(self.task, completed=steps)

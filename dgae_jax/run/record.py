@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Any
 import jax
 import numpy as np
 
-from dgae_jax.configs.build import Fitted
-from dgae_jax.configs.config import Config
+from dgae_jax.configs.resolved import ResolvedConfig
+from dgae_jax.learn.build import InferenceState
 from dgae_jax.learn.types import TrainState
 from dgae_jax.physics.engine import PhysicsState
 from dgae_jax.run import checkpoint, hosts, notebook
@@ -33,7 +33,7 @@ class Record:
     Checkpoints and plots are written beside the training, one after the other; a failure is raised by the call after.
     """
 
-    def __init__(self, run_dir: Path, config: Config, options: RunOptions, done: int):
+    def __init__(self, run_dir: Path, config: ResolvedConfig, options: RunOptions, done: int):
         self.run_dir, self.config, self.options = run_dir, config, options
         (run_dir / "checkpoints").mkdir(exist_ok=True)
         self.metrics = MetricsFile(run_dir / "metrics.jsonl", config, done)
@@ -75,17 +75,34 @@ class Record:
         self.feed.rows(rows)
         if self.options.debug_nonfinite:
             self._save_incidents(state, {row["seed"] for row in rows if row["nonfinite"]})
-        returns = [row["episode_return"] for row in rows[-self.config.num_seeds :] if row["episode_return"] is not None]
+        returns = [
+            row["episode_return"]
+            for row in rows[-self.config.num_seeds :]
+            if row["episode_return"] is not None
+        ]
         return float(np.mean(returns)) if returns else None
 
     def save(self, state: TrainState) -> None:
         """Write a checkpoint, from a copy: the state itself may be consumed meanwhile."""
         keep = self.options.keep_checkpoints, self.evaluations.best
-        self._write(checkpoint.save, self.run_dir / "checkpoints", self.config, checkpoint.arrays_of(state), self.steps, *keep)
+        self._write(
+            checkpoint.save,
+            self.run_dir / "checkpoints",
+            self.config,
+            checkpoint.arrays_of(state),
+            self.steps,
+            *keep,
+        )
 
-    def evaluate(self, policies: Fitted, watch: Watch) -> dict[str, Any]:
+    def evaluate(self, policies: InferenceState, watch: Watch) -> dict[str, Any]:
         """Returns of the policies as they are now, noted and drawn."""
-        result = evaluate_policies(policies, self.config, engine=self.options.eval_engine, episodes=self.options.episodes, watch=watch)
+        result = evaluate_policies(
+            policies,
+            self.config,
+            engine=self.options.eval_engine,
+            episodes=self.options.episodes,
+            watch=watch,
+        )
         if not self.evaluated:
             self.pending.result()  # no evaluation is on the disk without its checkpoint, from which the run goes on
             self.evaluations.append(self.steps, result)
@@ -109,14 +126,27 @@ class Record:
     def _save_incidents(self, state: TrainState, seeds: set[int]) -> None:
         """Of every world that has turned non-finite the last state and action from which it did, per run: arrays by name."""
         for seed in sorted(seeds):
-            episodes = jax.tree.map(lambda x, i=seed - self.config.seed: x[i], hosts.whole(state.episodes))
+            episodes = jax.tree.map(
+                lambda x, i=seed - self.config.seed: x[i], hosts.whole(state.episodes)
+            )
             worlds = np.flatnonzero(episodes.nonfinite)
             world, action = jax.tree.map(lambda x, at=worlds: x[at], episodes.incident)
-            names = world._fields if isinstance(world, PhysicsState) else range(len(jax.tree.leaves(world)))
-            arrays = {str(name): leaf for name, leaf in zip(names, jax.tree.leaves(world), strict=True)}
+            names = (
+                world._fields
+                if isinstance(world, PhysicsState)
+                else range(len(jax.tree.leaves(world)))
+            )
+            arrays = {
+                str(name): leaf for name, leaf in zip(names, jax.tree.leaves(world), strict=True)
+            }
             directory = self.run_dir / "nonfinite"
             directory.mkdir(exist_ok=True)
-            np.savez(directory / f"steps_{self.steps:012d}_seed_{seed}.npz", world=worlds, **arrays, action=action)
+            np.savez(
+                directory / f"steps_{self.steps:012d}_seed_{seed}.npz",
+                world=worlds,
+                **arrays,
+                action=action,
+            )
 
 
 def _curve_module() -> Any:

@@ -33,7 +33,11 @@ class Signals:
 
     def __enter__(self) -> "Signals":
         if threading.current_thread() is threading.main_thread():
-            noted = [kind for kind in KINDS if kind != signal.SIGHUP or signal.getsignal(kind) != signal.SIG_IGN]
+            noted = [
+                kind
+                for kind in KINDS
+                if kind != signal.SIGHUP or signal.getsignal(kind) != signal.SIG_IGN
+            ]
             self.before = {kind: signal.signal(kind, self._note) for kind in noted}
         return self
 
@@ -88,4 +92,7 @@ class Signals:
         if self.nothing_to_lose:
             return
         with contextlib.suppress(OSError):  # no print: it may be what was interrupted
-            os.write(2, f"{self.name}: finishing what is running, then saving; a second signal ends it at once\n".encode())
+            os.write(
+                2,
+                f"{self.name}: finishing what is running, then saving; a second signal ends it at once\n".encode(),
+            )

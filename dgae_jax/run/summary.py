@@ -16,7 +16,9 @@ def summary(returns: np.ndarray) -> dict[str, Any]:
         "return_mean": float(returns.mean()),
         "return_std": float(returns.std()),
         "return_cvar": {str(share): mean_of_worst(returns, share) for share in (0.05, 0.1, 0.25)},
-        "return_quantiles": {str(q): float(np.quantile(returns, q)) for q in (0.05, 0.25, 0.5, 0.75, 0.95)},
+        "return_quantiles": {
+            str(q): float(np.quantile(returns, q)) for q in (0.05, 0.25, 0.5, 0.75, 0.95)
+        },
         "returns": [round(float(r), 4) for r in returns],
     }
 
@@ -45,14 +47,15 @@ def over_seeds(returns: list[np.ndarray]) -> dict[str, Any]:
 
 def describe(result: dict[str, Any]) -> str:
     """An evaluation in one line."""
-    seeds, where = len(result["seeds"]), f"of the deterministic policy in {result['env']} ({result['engine']})"
+    seeds, where = (
+        len(result["seeds"]),
+        f"of the deterministic policy in {result['env']} ({result['engine']})",
+    )
     if seeds == 1:
         return f"return {result['return_mean']:,.1f} ± {result['return_std']:,.1f} over {counted(result['episodes'], 'episode')} {where}"
     low, high = result["interval"]
     spread = f"standard deviation {result['seeds_std']:,.1f} over seeds, 95 % interval of the mean {low:,.1f} to {high:,.1f}"
-    return (
-        f"return {result['seeds_mean']:,.1f}, mean of {seeds} seeds × {counted(result['episodes'] // seeds, 'episode')} {where}; {spread}"
-    )
+    return f"return {result['seeds_mean']:,.1f}, mean of {seeds} seeds × {counted(result['episodes'] // seeds, 'episode')} {where}; {spread}"
 
 
 def counted(number: int, noun: str) -> str:

@@ -27,7 +27,9 @@ def prepare() -> None:
         try:
             os.fstat(descriptor)
         except OSError:
-            os.set_inheritable(os.open(os.devnull, os.O_RDWR), True)  # it takes the lowest number that is free: this one
+            os.set_inheritable(
+                os.open(os.devnull, os.O_RDWR), True
+            )  # it takes the lowest number that is free: this one
     for name in ("stdout", "stderr"):
         stream: Any = getattr(sys, name)
         if stream is None:
@@ -65,7 +67,12 @@ def is_silent() -> bool:
 def is_live() -> bool:
     """Whether stdout is a terminal that someone may be looking at, and on which a line can be written again."""
     try:
-        return sys.stdout is not None and sys.stdout.isatty() and os.environ.get("TERM") not in _DUMB and not _silent.get()
+        return (
+            sys.stdout is not None
+            and sys.stdout.isatty()
+            and os.environ.get("TERM") not in _DUMB
+            and not _silent.get()
+        )
     except ValueError:  # closed
         return False
 

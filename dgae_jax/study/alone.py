@@ -8,7 +8,7 @@ from optuna.trial import Trial
 
 from dgae_jax.configs.config import ConfigError
 from dgae_jax.run import loop, machine
-from dgae_jax.run.training import BrokeDownError
+from dgae_jax.run.training import DivergedError
 from dgae_jax.study.storage import first_number
 from dgae_jax.study.tuning import Tuning, quarter, value_of
 
@@ -31,8 +31,12 @@ def train(tuning: Tuning, study: optuna.Study, trial: Trial) -> float:
         every = quarter(config) * config.samples_per_iteration
         here = tuning.directory / "trials" / f"{first_number(study, trial):04d}"
         kept = {"checkpoint_every": every, "keep_checkpoints": 1, "num_processes": 1}
-        options = dataclasses.replace(tuning.options, run_dir=here, resume_or_start=True, inexact=True, **kept)
-        loop.prepared(config, options)  # `ready` has seen that it is not the machine that is at fault
+        options = dataclasses.replace(
+            tuning.options, run_dir=here, resume_or_start=True, inexact=True, **kept
+        )
+        loop.prepared(
+            config, options
+        )  # `ready` has seen that it is not the machine that is at fault
     except ConfigError as reason:
         raise optuna.TrialPruned(str(reason)) from reason
 
@@ -43,7 +47,7 @@ def train(tuning: Tuning, study: optuna.Study, trial: Trial) -> float:
 
     try:
         value = value_of(loop.go_on_or_start(config, options, heed).evaluation)
-    except BrokeDownError as reason:
+    except DivergedError as reason:
         raise optuna.TrialPruned(str(reason)) from reason
     if not math.isfinite(value):
         raise optuna.TrialPruned("its return is not finite")

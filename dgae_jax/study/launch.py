@@ -14,7 +14,8 @@ from dataclasses import dataclass
 from importlib.util import find_spec
 from typing import Protocol
 
-from dgae_jax.configs.config import invalid, lookup
+from dgae_jax.configs.config import invalid
+from dgae_jax.configs.validation import lookup
 from dgae_jax.physics.cores import cores
 from dgae_jax.study import on_ray, on_slurm
 from dgae_jax.study.work import Job, run
@@ -80,7 +81,10 @@ def local(jobs: Sequence[Job], options: LaunchOptions) -> Iterator[dict[Task, Jo
 
 def _processes() -> int:
     """Programs on a CPU gain less from a second core than a second program does; a GPU is filled by one."""
-    accelerated = any(find_spec(name) for name in ("jax_cuda12_plugin", "jax_cuda13_plugin")) and os.environ.get("JAX_PLATFORMS") != "cpu"
+    accelerated = (
+        any(find_spec(name) for name in ("jax_cuda12_plugin", "jax_cuda13_plugin"))
+        and os.environ.get("JAX_PLATFORMS") != "cpu"
+    )
     return 1 if accelerated else cores()
 
 

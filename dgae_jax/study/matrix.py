@@ -16,7 +16,8 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
-from dgae_jax.configs.config import Config, ConfigError, invalid
+from dgae_jax.configs.config import ConfigError, invalid
+from dgae_jax.configs.resolved import ResolvedConfig, resolve
 from dgae_jax.configs.serial import differences, from_dict, to_dict
 from dgae_jax.run import directory, files
 
@@ -32,12 +33,14 @@ class Cell(NamedTuple):
 
     name: str
     """ENV-ALGO-SEED, or ENV-VARIANT-SEED, and the last of its seeds where it trains several."""
-    config: Config
+    config: ResolvedConfig
 
     @property
     def kind(self) -> str:
         """The algorithm or the variant."""
-        before, after = _name(self.config.env, "/", range(self.config.seed, self.config.seed + self.config.num_seeds)).split("/")
+        before, after = _name(
+            self.config.env, "/", range(self.config.seed, self.config.seed + self.config.num_seeds)
+        ).split("/")
         return self.name.removeprefix(before).removesuffix(after)
 
 
@@ -63,7 +66,11 @@ class Study(NamedTuple):
 
 
 def matrix(
-    tasks: Sequence[str], kinds: Sequence[str], seeds: Sequence[int], per_run: int, make: Callable[[str, str], Config]
+    tasks: Sequence[str],
+    kinds: Sequence[str],
+    seeds: Sequence[int],
+    per_run: int,
+    make: Callable[[str, str], ResolvedConfig],
 ) -> list[Cell]:
     """Tasks × kinds × seeds, the first seeds of all first; a kind is an algorithm or a variant.
 
@@ -71,9 +78,16 @@ def matrix(
     one run.
     """
     configs = {(task, kind): make(task, kind) for task, kind in itertools.product(tasks, kinds)}
-    seeded = ((task, kind, config, some) for some in _groups(seeds, per_run) for (task, kind), config in configs.items())
+    seeded = (
+        (task, kind, config, some)
+        for some in _groups(seeds, per_run)
+        for (task, kind), config in configs.items()
+    )
     return [
-        Cell(_name(task, kind, some), dataclasses.replace(config, seed=some[0], num_seeds=len(some))) for task, kind, config, some in seeded
+        Cell(
+            _name(task, kind, some), dataclasses.replace(config, seed=some[0], num_seeds=len(some))
+        )
+        for task, kind, config, some in seeded
     ]
 
 
@@ -81,7 +95,11 @@ def _groups(seeds: Sequence[int], per_run: int) -> Iterator[Sequence[int]]:
     for i in range(0, len(seeds), per_run):
         some = seeds[i : i + per_run]
         if list(some) != list(range(some[0], some[0] + len(some))):
-            raise invalid("seeds_per_run", per_run, f"1, or a number of seeds that follow each other, not {list(some)}")
+            raise invalid(
+                "seeds_per_run",
+                per_run,
+                f"1, or a number of seeds that follow each other, not {list(some)}",
+            )
         yield some
 
 
@@ -98,30 +116,47 @@ def opened(path: Path, cells: Sequence[Cell], command: str) -> Iterator[Study]:
     Raises ConfigError if `path` holds anything else, cannot be written or is in use, or if a cell has another configuration there.
     """
     try:
-        if path.exists() and not (path / "study.json").exists() and any(each.name != ".lock" for each in path.iterdir()):
+        if (
+            path.exists()
+            and not (path / "study.json").exists()
+            and any(each.name != ".lock" for each in path.iterdir())
+        ):
             raise ConfigError(f"study {path}: must be a study, or a new or empty directory")
         path.mkdir(parents=True, exist_ok=True)
         with (path / ".lock").open("w") as lock:
-            directory.hold(lock, ConfigError(f"study {path}: must not be in use; another process runs it"))
+            directory.hold(
+                lock, ConfigError(f"study {path}: must not be in use; another process runs it")
+            )
             before = read(path) if (path / "study.json").exists() else Study(path, (), {})
             study = _joined(before, cells, command)
             for part in ("runs", "logs", "policies"):
                 (path / part).mkdir(exist_ok=True)
             if study != before:
                 each = {name: to_dict(config) for name, config in study.cells}
-                files.write_json(path / "study.json", {"schema": SCHEMA, "cells": each, "commands": study.commands})
+                files.write_json(
+                    path / "study.json",
+                    {"schema": SCHEMA, "cells": each, "commands": study.commands},
+                )
             yield study
     except OSError as reason:
-        raise ConfigError(f"study {path}: must be a directory that can be written ({reason.strerror})") from reason
+        raise ConfigError(
+            f"study {path}: must be a directory that can be written ({reason.strerror})"
+        ) from reason
 
 
 def _joined(before: Study, cells: Sequence[Cell], command: str) -> Study:
     there = dict(before.cells)
     for name, config in cells:
         for setting, (ours, theirs) in differences(config, there.get(name, config)).items():
-            raise ConfigError(f"cell {name}: its {setting} must be {theirs} as in {before.path}, not {ours}; another study can have it so")
+            raise ConfigError(
+                f"cell {name}: its {setting} must be {theirs} as in {before.path}, not {ours}; another study can have it so"
+            )
     new = [cell for cell in cells if cell.name not in there]
-    return Study(before.path, (*before.cells, *new), {**before.commands, **{cell.name: command for cell in new}})
+    return Study(
+        before.path,
+        (*before.cells, *new),
+        {**before.commands, **{cell.name: command for cell in new}},
+    )
 
 
 def read(path: Path) -> Study:
@@ -129,13 +164,21 @@ def read(path: Path) -> Study:
     try:
         data = json.loads((path / "study.json").read_bytes())
         if data["schema"] != SCHEMA:
-            raise ConfigError(f"{path / 'study.json'}: has schema {data['schema']}, this version reads {SCHEMA}")
-        cells = tuple(Cell(name, from_dict(config)) for name, config in data["cells"].items())
+            raise ConfigError(
+                f"{path / 'study.json'}: has schema {data['schema']}, this version reads {SCHEMA}"
+            )
+        cells = tuple(
+            Cell(name, resolve(from_dict(config))) for name, config in data["cells"].items()
+        )
         for name, _ in cells:
             if not NAME.fullmatch(name):  # it becomes the name of files
                 raise ValueError(f"cell {name[:100]!r} has no such name")
         return Study(path, cells, dict(data["commands"]))
     except OSError as reason:
-        raise ConfigError(f"study {path}: must be the directory of a study ({reason.strerror})") from reason
+        raise ConfigError(
+            f"study {path}: must be the directory of a study ({reason.strerror})"
+        ) from reason
     except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as reason:
-        raise ConfigError(f"{path / 'study.json'}: must be a study that can be read ({reason})") from reason
+        raise ConfigError(
+            f"{path / 'study.json'}: must be a study that can be read ({reason})"
+        ) from reason

@@ -39,10 +39,20 @@ def launch(jobs: Sequence[Job], options: Any) -> Iterator[dict[Any, Job]]:
     import ray  # pyright: ignore[reportMissingImports]
 
     try:
-        ray.init(options.address or "local", log_to_driver=False, logging_level=logging.ERROR, ignore_reinit_error=True)
+        ray.init(
+            options.address or "local",
+            log_to_driver=False,
+            logging_level=logging.ERROR,
+            ignore_reinit_error=True,
+        )
     except (ConnectionError, RuntimeError, ValueError) as reason:
-        raise ConfigError(f"address {options.address}: must be where a Ray cluster answers ({_line(reason)})", "address") from reason
-    task = ray.remote(num_cpus=options.cpus_per_run, num_gpus=options.gpus_per_run, max_retries=-1)(run)
+        raise ConfigError(
+            f"address {options.address}: must be where a Ray cluster answers ({_line(reason)})",
+            "address",
+        ) from reason
+    task = ray.remote(num_cpus=options.cpus_per_run, num_gpus=options.gpus_per_run, max_retries=-1)(
+        run
+    )
     try:
         yield {task.remote(job).future(): job for job in jobs}
     finally:

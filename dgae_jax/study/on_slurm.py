@@ -29,7 +29,9 @@ class _Cell:
 def check(settings: Sequence[str], gpus: float) -> None:
     """Raise ConfigError if there is no Slurm here, or a setting is not NAME=VALUE."""
     if not find_spec("submitit"):
-        raise invalid("launcher", "slurm", 'used with submitit installed: pip install "dgae_jax[slurm]"')
+        raise invalid(
+            "launcher", "slurm", 'used with submitit installed: pip install "dgae_jax[slurm]"'
+        )
     if CLUSTER == "slurm" and not shutil.which("sbatch"):
         raise invalid("launcher", "slurm", "used where Slurm is: there is no sbatch here")
     if gpus != int(gpus):
@@ -55,10 +57,14 @@ def launch(jobs: Sequence[Job], options: Any) -> Iterator[dict[Any, Job]]:
 
     executor = submitit.AutoExecutor(folder=jobs[0].study.path / "slurm" / "%j", cluster=CLUSTER)
     try:
-        executor.update_parameters(name="dgae", cpus_per_task=options.cpus_per_run, **parameters(options.slurm))
+        executor.update_parameters(
+            name="dgae", cpus_per_task=options.cpus_per_run, **parameters(options.slurm)
+        )
         if options.gpus_per_run:
             executor.update_parameters(gpus_per_node=int(options.gpus_per_run))
         submitted = executor.map_array(_Cell(), jobs)
     except (NameError, TypeError, submitit.core.utils.FailedSubmissionError) as reason:
-        raise ConfigError(f"slurm: must be settings that submitit and Slurm take ({str(reason)[:300]})", "slurm") from reason
+        raise ConfigError(
+            f"slurm: must be settings that submitit and Slurm take ({str(reason)[:300]})", "slurm"
+        ) from reason
     yield dict(zip(submitted, jobs, strict=True))

@@ -41,7 +41,9 @@ class Progress:
 
 def ranked(trials: list[FrozenTrial]) -> list[FrozenTrial]:
     """Those that got to their end, the best first."""
-    return sorted((t for t in trials if t.state == TrialState.COMPLETE), key=lambda t: (-_value(t), t.number))
+    return sorted(
+        (t for t in trials if t.state == TrialState.COMPLETE), key=lambda t: (-_value(t), t.number)
+    )
 
 
 def _value(trial: FrozenTrial) -> float:
@@ -67,14 +69,20 @@ def write(tuning: Tuning, study: optuna.Study) -> int:
     files.replace(tuning.directory / "trials.csv", _csv(tuning, trials))
     best = ranked(trials)
     if not best:
-        terminal.warn(f"no trial got to its end: all {len(trials)} were pruned or broke down; see {tuning.directory}/worker-*.log")
+        terminal.warn(
+            f"no trial got to its end: all {len(trials)} were pruned or broke down; see {tuning.directory}/worker-*.log"
+        )
         return 1
     files.write_json(tuning.directory / "best.json", to_dict(tuning.best(best[0].params)))
     tuning_page.write(tuning, study, best)
     terminal.say(table(tuning, best[:TOP]))
     pruned = len(trials) - len(best)
-    terminal.say(f"{len(trials)} trials, {pruned} of them pruned; all of them in {tuning.directory / 'trials.csv'}, plots in tuning.html")
-    terminal.say(f"train with the best settings: dgae train --config {tuning.directory / 'best.json'}")
+    terminal.say(
+        f"{len(trials)} trials, {pruned} of them pruned; all of them in {tuning.directory / 'trials.csv'}, plots in tuning.html"
+    )
+    terminal.say(
+        f"train with the best settings: dgae train --config {tuning.directory / 'best.json'}"
+    )
     return 0
 
 
@@ -85,14 +93,28 @@ def _csv(tuning: Tuning, trials: list[FrozenTrial]) -> bytes:
     writer.writerow(["trial", "state", "return_mean", "seconds", *tuning.space])
     for trial in trials:
         seconds = trial.duration.total_seconds() if trial.duration else None
-        writer.writerow([trial.number, trial.state.name.lower(), trial.value, seconds, *(trial.params.get(path) for path in tuning.space)])
+        writer.writerow(
+            [
+                trial.number,
+                trial.state.name.lower(),
+                trial.value,
+                seconds,
+                *(trial.params.get(path) for path in tuning.space),
+            ]
+        )
     return text.getvalue().encode()
 
 
 def table(tuning: Tuning, trials: list[FrozenTrial]) -> str:
     """Trials as aligned lines; where many settings are searched, the last ones do not fit."""
     rows = [["trial", "return", *tuning.space]]
-    rows += [[str(t.number), f"{_value(t):,.1f}", *(_short(t.params[path]) for path in tuning.space)] for t in trials]
+    rows += [
+        [str(t.number), f"{_value(t):,.1f}", *(_short(t.params[path]) for path in tuning.space)]
+        for t in trials
+    ]
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     fit = sum(1 for i in range(len(widths)) if sum(widths[: i + 1]) + 2 * i <= WIDTH)
-    return "\n".join("  ".join(text.rjust(width) for text, width in zip(row[:fit], widths[:fit], strict=True)) for row in rows)
+    return "\n".join(
+        "  ".join(text.rjust(width) for text, width in zip(row[:fit], widths[:fit], strict=True))
+        for row in rows
+    )

@@ -26,11 +26,16 @@ def reproduce(study: Study, cells: Sequence[Cell], options: RunOptions, launch: 
 
     0 all are done; 1 some failed; 128 + the signal if one came: the same call goes on. Raises ConfigError if the launcher cannot start.
     """
-    jax.config.update("jax_platforms", "cpu")  # accelerators are the cells': what is read here is small
+    jax.config.update(
+        "jax_platforms", "cpu"
+    )  # accelerators are the cells': what is read here is small
     rows = results.of_study(study)
     results.write(study, rows)
     jobs = [Job(study, cell, options) for cell in cells if cell.name not in rows]
-    terminal.say(f"{study.path}: {len(cells) - len(jobs)} of {len(cells)} cells are done" + (f", {len(jobs)} to train" if jobs else ""))
+    terminal.say(
+        f"{study.path}: {len(cells) - len(jobs)} of {len(cells)} cells are done"
+        + (f", {len(jobs)} to train" if jobs else "")
+    )
     failed = []
     with (
         Signals() as signals,
@@ -68,7 +73,9 @@ def _failure(study: Study, cell: Cell, task: Task) -> str | None:
         return f"{type(reason).__name__}: {str(reason).partition(chr(10))[0][:200]}"
     if code == 0 and results.is_done(study, cell):
         return None
-    lines = study.log(cell).read_text(errors="replace").split("\n") if study.log(cell).is_file() else []
+    lines = (
+        study.log(cell).read_text(errors="replace").split("\n") if study.log(cell).is_file() else []
+    )
     last = next((line for line in reversed(lines) if line.strip()), "it said nothing")
     return f"ended with exit code {code}: {last.strip()[:300]}"
 
@@ -76,6 +83,13 @@ def _failure(study: Study, cell: Cell, task: Task) -> str | None:
 def _done(cell: Cell, rows: list[dict[str, Any]]) -> tuple[str, float]:
     """A line about a cell that is done, and its mean return."""
     means = [row["final"]["return_mean"] for row in rows]
-    spread = f" ± {rows[0]['final']['return_std']:,.1f}" if len(rows) == 1 else f", mean of {len(rows)} seeds"
+    spread = (
+        f" ± {rows[0]['final']['return_std']:,.1f}"
+        if len(rows) == 1
+        else f", mean of {len(rows)} seeds"
+    )
     mean = float(np.mean([np.nan if x is None else x for x in means]))
-    return f"{cell.name}: return {mean:,.1f}{spread}, {rows[0]['samples_per_second']:,.0f} steps/s", mean
+    return (
+        f"{cell.name}: return {mean:,.1f}{spread}, {rows[0]['samples_per_second']:,.0f} steps/s",
+        mean,
+    )

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from dgae_jax.configs.config import Config
+from dgae_jax.configs.resolved import ResolvedConfig
 from dgae_jax.configs.serial import to_dict
 from dgae_jax.run import evaluations, files, metrics
 from dgae_jax.study.matrix import Cell, Study
@@ -41,8 +41,13 @@ def rows_of(study: Study, cell: Cell) -> list[dict[str, Any]]:
     """A row per seed of a cell that is done; its policy is written too."""
     run_dir, config = study.run_dir(cell), cell.config
     _keep_policy(run_dir, config, study.policy(cell))
-    final, manifest = (json.loads((run_dir / name).read_bytes()) for name in ("evaluation.json", "manifest.json"))
-    trained, evaluated = metrics.read(run_dir / "metrics.jsonl"), evaluations.EvaluationsFile(run_dir / "evaluations.jsonl").rows
+    final, manifest = (
+        json.loads((run_dir / name).read_bytes()) for name in ("evaluation.json", "manifest.json")
+    )
+    trained, evaluated = (
+        metrics.read(run_dir / "metrics.jsonl"),
+        evaluations.EvaluationsFile(run_dir / "evaluations.jsonl").rows,
+    )
     head = {
         "cell": cell.name,
         **{name: getattr(config, name) for name in ("env", "env_version", "algo", "physics")},
@@ -50,7 +55,9 @@ def rows_of(study: Study, cell: Cell) -> list[dict[str, Any]]:
     }
     tail = {
         "seconds": trained[-1]["seconds"],
-        "samples_per_second": round(config.num_seeds * trained[-1]["steps"] / trained[-1]["seconds"], 1),
+        "samples_per_second": round(
+            config.num_seeds * trained[-1]["steps"] / trained[-1]["seconds"], 1
+        ),
         "policy": str(study.policy(cell).relative_to(study.path)),
         "config": to_dict(config),
         "versions": manifest["versions"],
@@ -65,10 +72,15 @@ def rows_of(study: Study, cell: Cell) -> list[dict[str, Any]]:
             "total_steps": config.total_steps,
             "steps": trained[-1]["steps"],
             "hash": digest(config),
-            "final": {name: final[name] for name in ("engine", "env")} | {"episodes": len(one["returns"])} | _returns(one),
+            "final": {name: final[name] for name in ("engine", "env")}
+            | {"episodes": len(one["returns"])}
+            | _returns(one),
             "best": _best([row for row in evaluated if row["seed"] == one["seed"]]),
             "curve": _curve([row for row in trained if row["seed"] == one["seed"]]),
-            "evaluations": {name: [row[name] for row in evaluated if row["seed"] == one["seed"]] for name in ("steps", "return_mean")},
+            "evaluations": {
+                name: [row[name] for row in evaluated if row["seed"] == one["seed"]]
+                for name in ("steps", "return_mean")
+            },
             **tail,
         }
         for one in final["seeds"]
@@ -77,10 +89,13 @@ def rows_of(study: Study, cell: Cell) -> list[dict[str, Any]]:
 
 def write(study: Study, rows: dict[str, list[dict[str, Any]]]) -> None:
     """The rows of all cells that are done, in the order of the study."""
-    files.replace(study.path / "results.jsonl", files.json_lines(row for cell in study.cells for row in rows.get(cell.name, [])))
+    files.replace(
+        study.path / "results.jsonl",
+        files.json_lines(row for cell in study.cells for row in rows.get(cell.name, [])),
+    )
 
 
-def digest(config: Config) -> str:
+def digest(config: ResolvedConfig) -> str:
     """The same for configurations that differ in nothing but their seeds."""
     plain = json.dumps(to_dict(dataclasses.replace(config, seed=0, num_seeds=1)), sort_keys=True)
     return hashlib.sha256(plain.encode()).hexdigest()[:12]
@@ -99,7 +114,9 @@ def _best(evaluated: list[dict[str, Any]]) -> dict[str, Any] | None:
 def _curve(rows: list[dict[str, Any]]) -> dict[str, list]:
     """Means of the episode return over `POINTS` stretches of equal length, at the end of each; null where no episode has ended yet."""
     steps = np.array([row["steps"] for row in rows])
-    returns = np.array([math.nan if row["episode_return"] is None else row["episode_return"] for row in rows])
+    returns = np.array(
+        [math.nan if row["episode_return"] is None else row["episode_return"] for row in rows]
+    )
     parts = [part for part in np.array_split(np.arange(len(rows)), POINTS) if len(part)]
     means = [returns[part][np.isfinite(returns[part])] for part in parts]
     return {
@@ -108,10 +125,10 @@ def _curve(rows: list[dict[str, Any]]) -> dict[str, list]:
     }
 
 
-def _keep_policy(run_dir: Path, config: Config, path: Path) -> None:
+def _keep_policy(run_dir: Path, config: ResolvedConfig, path: Path) -> None:
     """Write it unless it is there already, from this run: a cell that is trained again has a new one."""
     if not path.is_file() or path.stat().st_mtime < (run_dir / "evaluation.json").stat().st_mtime:
         from dgae_jax.run import restore
 
-        found = restore.trained(run_dir, config, "newest")
+        found = restore.trained(run_dir, config, "latest")
         restore.save_networks(path, config, found, restore.reward_std(found.path, config))

@@ -11,13 +11,22 @@ from dataclasses import dataclass
 from types import UnionType
 from typing import Any, get_args, get_origin, get_type_hints
 
-from dgae_jax.configs.config import Config, ConfigError, CriticConfig, PolicyConfig, floats_of, invalid
-from dgae_jax.configs.validation import validate
+from dgae_jax.configs.config import ConfigError, CriticConfig, PolicyConfig, floats_of, invalid
+from dgae_jax.configs.resolved import ResolvedConfig, resolve
 
 USUAL = ("gamma=0.95:0.9999", "lam=0.5:1")
 """What the paper tuned for each method."""
 
-SAME_FOR_ALL = ("env", "env_version", "algo", "physics", "seed", "num_seeds", "total_steps", "episode_length")
+SAME_FOR_ALL = (
+    "env",
+    "env_version",
+    "algo",
+    "physics",
+    "seed",
+    "num_seeds",
+    "total_steps",
+    "episode_length",
+)
 """What the trials of a tuning share, since it says what is measured."""
 
 LISTED = 1000
@@ -68,7 +77,7 @@ Space = dict[str, Range | Choice]
 """By the path of each setting."""
 
 
-def space_of(words: Sequence[str], config: Config) -> Space:
+def space_of(words: Sequence[str], config: ResolvedConfig) -> Space:
     """What `words` say, checked against the rest of `config`.
 
     Raises ConfigError for an unknown setting, one that the algorithm does not use, a malformed range and values that are invalid.
@@ -80,22 +89,24 @@ def space_of(words: Sequence[str], config: Config) -> Space:
             raise invalid("search", word, f"the only range of {path}")
         for value in dimension.examples:
             try:
-                validate(with_values(config, {path: value}))
+                resolve(with_values(config, {path: value}))
             except ConfigError as reason:
                 raise invalid("search", word, f"valid throughout ({reason})") from None
         space[path] = dimension
     return space
 
 
-def with_values(config: Config, values: dict[str, Any]) -> Config:
+def with_values(config: ResolvedConfig, values: dict[str, Any]) -> ResolvedConfig:
     """The configuration with some settings, by path, replaced."""
     for path, value in values.items():
-        layers = isinstance(value, str) and _is_layers(_kinds(Config)[path])
-        config = _replaced(config, path.split("."), tuple(map(int, value.split("x"))) if layers else value)
+        layers = isinstance(value, str) and _is_layers(_kinds(ResolvedConfig)[path])
+        config = _replaced(
+            config, path.split("."), tuple(map(int, value.split("x"))) if layers else value
+        )
     return config
 
 
-def values_of(config: Config, space: Space) -> dict[str, Any]:
+def values_of(config: ResolvedConfig, space: Space) -> dict[str, Any]:
     """What the configuration has of what is searched, as a trial writes it."""
     values = {}
     for path in space:
@@ -109,13 +120,15 @@ def values_of(config: Config, space: Space) -> dict[str, Any]:
 def is_traced(path: str) -> bool:
     """Whether one compiled program serves all values of a setting."""
     part, _, name = path.rpartition(".")
-    cls = {"": Config, "policy": PolicyConfig, "critic": CriticConfig}.get(part)
+    cls = {"": ResolvedConfig, "policy": PolicyConfig, "critic": CriticConfig}.get(part)
     return cls is not None and name in floats_of(cls)
 
 
 def _replaced(settings: Any, path: list[str], value: Any) -> Any:
     name, *rest = path
-    return dataclasses.replace(settings, **{name: _replaced(getattr(settings, name), rest, value) if rest else value})
+    return dataclasses.replace(
+        settings, **{name: _replaced(getattr(settings, name), rest, value) if rest else value}
+    )
 
 
 def _kinds(cls: type, prefix: str = "") -> dict[str, Any]:
@@ -134,9 +147,16 @@ def _is_layers(kind: Any) -> bool:
 
 def _dimension(word: str) -> tuple[str, Range | Choice]:
     name, equals, text = word.partition("=")
-    path, kinds = name.replace("-", "_"), {path: kind for path, kind in _kinds(Config).items() if path not in SAME_FOR_ALL}
+    path, kinds = (
+        name.replace("-", "_"),
+        {path: kind for path, kind in _kinds(ResolvedConfig).items() if path not in SAME_FOR_ALL},
+    )
     if not (equals and text):
-        raise invalid("search", word, "SETTING=LOW:HIGH, =log:LOW:HIGH, =int:LOW:HIGH, =int:log:LOW:HIGH or =VALUE,VALUE")
+        raise invalid(
+            "search",
+            word,
+            "SETTING=LOW:HIGH, =log:LOW:HIGH, =int:LOW:HIGH, =int:log:LOW:HIGH or =VALUE,VALUE",
+        )
     if path in SAME_FOR_ALL:
         raise invalid("search", word, f"of another setting: all trials have the same {path}")
     if path not in kinds:
@@ -147,13 +167,25 @@ def _dimension(word: str) -> tuple[str, Range | Choice]:
 def _range(word: str, text: str, kind: Any) -> Range:
     *how, low, high = text.split(":")
     if tuple(how) not in ((), ("log",), ("int",), ("int", "log")) or kind not in (int, float):
-        raise invalid("search", word, "LOW:HIGH, log:LOW:HIGH, int:LOW:HIGH or int:log:LOW:HIGH of a setting that is a number")
+        raise invalid(
+            "search",
+            word,
+            "LOW:HIGH, log:LOW:HIGH, int:LOW:HIGH or int:log:LOW:HIGH of a setting that is a number",
+        )
     if ("int" in how) != (kind is int):
-        raise invalid("search", word, "int:LOW:HIGH, its values are whole" if kind is int else "without int:, its values are not whole")
+        raise invalid(
+            "search",
+            word,
+            "int:LOW:HIGH, its values are whole"
+            if kind is int
+            else "without int:, its values are not whole",
+        )
     try:
         found = Range(_number(low, kind), _number(high, kind), "log" in how, kind is int)
     except ValueError:
-        raise invalid("search", word, f"between {'whole numbers' if kind is int else 'numbers'}, LOW:HIGH") from None
+        raise invalid(
+            "search", word, f"between {'whole numbers' if kind is int else 'numbers'}, LOW:HIGH"
+        ) from None
     if not found.low < found.high:
         raise invalid("search", word, "LOW:HIGH with LOW below HIGH")
     if found.log and found.low <= 0:
@@ -165,7 +197,11 @@ def _choice(word: str, text: str, kind: Any) -> Choice:
     try:
         values = tuple(_value(each, kind) for each in text.split(","))
     except ValueError:
-        raise invalid("search", word, f"a list of {_NAMES.get(kind, 'widths of layers, 64x64')}, with commas between them") from None
+        raise invalid(
+            "search",
+            word,
+            f"a list of {_NAMES.get(kind, 'widths of layers, 64x64')}, with commas between them",
+        ) from None
     if len(set(values)) != len(values) or len(values) < 2:
         raise invalid("search", word, "a list of two or more different values")
     return Choice(values)
@@ -179,7 +215,11 @@ def _value(text: str, kind: Any) -> Any:
     if _is_layers(kind):
         return "x".join(str(int(width)) for width in text.split("x"))
     if kind is bool:
-        return {"true": True, "false": False}[text.lower()] if text.lower() in ("true", "false") else _no_value(text)
+        return (
+            {"true": True, "false": False}[text.lower()]
+            if text.lower() in ("true", "false")
+            else _no_value(text)
+        )
     if kind in (int, float):
         return _number(text, kind)
     return text or _no_value(text)

@@ -10,7 +10,12 @@ from typing import Any
 import numpy as np
 import optuna
 import sqlalchemy.exc
-from optuna.distributions import BaseDistribution, CategoricalDistribution, FloatDistribution, IntDistribution
+from optuna.distributions import (
+    BaseDistribution,
+    CategoricalDistribution,
+    FloatDistribution,
+    IntDistribution,
+)
 from optuna.storages import RDBStorage, RetryHeartbeatStaleTrialCallback
 from optuna.trial import FrozenTrial, Trial, TrialState
 
@@ -45,19 +50,35 @@ def open_storage(tuning: Tuning) -> RDBStorage:
     """The database, made if there is none; raises ConfigError if it cannot be reached."""
     optuna.logging.set_verbosity(optuna.logging.ERROR)
     file = f"sqlite:///{tuning.directory.absolute() / 'optuna.db'}"
-    engine: dict[str, Any] = {"pool_pre_ping": True} if tuning.storage else {"connect_args": {"timeout": WAIT}}
+    engine: dict[str, Any] = (
+        {"pool_pre_ping": True} if tuning.storage else {"connect_args": {"timeout": WAIT}}
+    )
     for attempt in range(5):
         try:
             with unwarned():
                 retry = RetryHeartbeatStaleTrialCallback(RETRIES, inherit_intermediate_values=True)
-                beat: dict[str, Any] = {"heartbeat_interval": tuning.heartbeat, "grace_period": 3 * tuning.heartbeat}
-                return RDBStorage(tuning.storage or file, engine, **beat, heartbeat_stale_trial_callback=retry)
-        except (sqlalchemy.exc.SQLAlchemyError, optuna.exceptions.OptunaError, ImportError) as reason:
-            if attempt < 4 and any(words in str(reason) for words in ("already exists", "duplicate key", "UNIQUE constraint")):
+                beat: dict[str, Any] = {
+                    "heartbeat_interval": tuning.heartbeat,
+                    "grace_period": 3 * tuning.heartbeat,
+                }
+                return RDBStorage(
+                    tuning.storage or file, engine, **beat, heartbeat_stale_trial_callback=retry
+                )
+        except (
+            sqlalchemy.exc.SQLAlchemyError,
+            optuna.exceptions.OptunaError,
+            ImportError,
+        ) as reason:
+            if attempt < 4 and any(
+                words in str(reason)
+                for words in ("already exists", "duplicate key", "UNIQUE constraint")
+            ):
                 time.sleep(0.5)  # another process is making the tables
                 continue
             why = str(getattr(reason, "orig", None) or reason).partition("\n")[0]
-            raise invalid("storage", _shown(tuning.storage or file), f"a database that can be reached ({why})") from reason
+            raise invalid(
+                "storage", _shown(tuning.storage or file), f"a database that can be reached ({why})"
+            ) from reason
     raise AssertionError
 
 
@@ -78,8 +99,14 @@ def open_study(tuning: Tuning, storage: RDBStorage, worker: int = 0) -> optuna.S
     _agree(study, tuning)
     if not study.get_trials(deepcopy=False) and not tuning.outside:
         study.enqueue_trial(values_of(tuning.config, tuning.space), skip_if_exists=True)
-    entropy = (tuning.sampler_seed, worker, len(study.get_trials(deepcopy=False)))  # one that goes on draws other numbers
-    study.sampler = optuna.samplers.TPESampler(seed=int(np.random.SeedSequence(entropy).generate_state(1)[0]))
+    entropy = (
+        tuning.sampler_seed,
+        worker,
+        len(study.get_trials(deepcopy=False)),
+    )  # one that goes on draws other numbers
+    study.sampler = optuna.samplers.TPESampler(
+        seed=int(np.random.SeedSequence(entropy).generate_state(1)[0])
+    )
     return study
 
 
@@ -97,11 +124,16 @@ def _agree(study: optuna.Study, tuning: Tuning) -> None:
         study.set_user_attr(FACTS, ours)
         return
     changed = {flag: (ours[name], theirs.get(name, ours[name])) for name, flag in JUDGED.items()}
-    changed |= {f"search {path}": (ours["search"].get(path), theirs["search"].get(path)) for path in {**ours["search"], **theirs["search"]}}
+    changed |= {
+        f"search {path}": (ours["search"].get(path), theirs["search"].get(path))
+        for path in {**ours["search"], **theirs["search"]}
+    }
     changed |= differences(tuning.config, from_dict(theirs["config"]))
     for setting, (now, then) in changed.items():
         if now != then:
-            raise invalid(setting, now, f"{then} as in the study {study.study_name}, or with another --study")
+            raise invalid(
+                setting, now, f"{then} as in the study {study.study_name}, or with another --study"
+            )
 
 
 def distributions(tuning: Tuning) -> dict[str, BaseDistribution]:
@@ -132,13 +164,17 @@ def first_number(study: optuna.Study, trial: Trial | FrozenTrial) -> int:
 
 
 @contextlib.contextmanager
-def alive(study: optuna.Study, storage: RDBStorage, trials: list[Trial], every: float) -> Iterator[None]:
+def alive(
+    study: optuna.Study, storage: RDBStorage, trials: list[Trial], every: float
+) -> Iterator[None]:
     """Signs of life of trials while they run, which Optuna gives in its own loop only."""
     over = threading.Event()
 
     def beat():
         while True:
-            with contextlib.suppress(optuna.exceptions.StorageInternalError, sqlalchemy.exc.SQLAlchemyError):
+            with contextlib.suppress(
+                optuna.exceptions.StorageInternalError, sqlalchemy.exc.SQLAlchemyError
+            ):
                 for trial in trials:
                     storage.record_heartbeat(trial._trial_id)
             if over.wait(every):

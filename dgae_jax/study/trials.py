@@ -38,7 +38,11 @@ def take(study: optuna.Study, tuning: Tuning) -> list[Trial]:
 
 def _is_wanted(study: optuna.Study, tuning: Tuning, trial: Trial) -> bool:
     """Two processes may take the last trial at once: the later one gives way."""
-    before = [t for t in study.get_trials(deepcopy=False, states=(*DONE, TrialState.RUNNING)) if t.number < trial.number]
+    before = [
+        t
+        for t in study.get_trials(deepcopy=False, states=(*DONE, TrialState.RUNNING))
+        if t.number < trial.number
+    ]
     if len(before) < tuning.trials:
         return True
     study.tell(trial, state=TrialState.FAIL)
@@ -49,5 +53,9 @@ def _give_up_the_silent(study: optuna.Study, tuning: Tuning) -> None:
     """Fail trials whose process was lost between taking them and their first sign of life, which Optuna waits for forever."""
     long_ago = datetime.datetime.now() - datetime.timedelta(seconds=60 + 3 * tuning.heartbeat)
     for trial in study.get_trials(deepcopy=False, states=(TrialState.RUNNING,)):
-        if "taken" not in trial.user_attrs and trial.datetime_start is not None and trial.datetime_start < long_ago:
+        if (
+            "taken" not in trial.user_attrs
+            and trial.datetime_start is not None
+            and trial.datetime_start < long_ago
+        ):
             study.tell(trial.number, state=TrialState.FAIL, skip_if_finished=True)

@@ -27,7 +27,9 @@ def tune(tuning: Tuning) -> int:
     try:
         (tuning.directory / "trials").mkdir(parents=True, exist_ok=True)
     except OSError as reason:
-        raise invalid("study", tuning.directory, f"a directory that can be written ({reason.strerror})") from reason
+        raise invalid(
+            "study", tuning.directory, f"a directory that can be written ({reason.strerror})"
+        ) from reason
     from dgae_jax.run.signals import Signals
     from dgae_jax.study import outcome
     from dgae_jax.study.storage import open_storage, open_study
@@ -35,7 +37,9 @@ def tune(tuning: Tuning) -> int:
 
     study = open_study(tuning, open_storage(tuning))
     for path, value in tuning.outside.items():
-        terminal.say(f"the start's own {path} {value} is outside of {tuning.space[path]}, so it is no trial")
+        terminal.say(
+            f"the start's own {path} {value} is outside of {tuning.space[path]}, so it is no trial"
+        )
     progress = outcome.Progress(study)
     with Signals() as signals:
         processes = [] if is_over(study, tuning) else start(tuning)
@@ -57,14 +61,19 @@ def tune(tuning: Tuning) -> int:
         with files.turn(tuning.directory):
             return outcome.write(tuning, study)
     except OSError as reason:
-        raise ConfigError(f"{reason.filename}: must be a file that can be written ({reason.strerror})") from reason
+        raise ConfigError(
+            f"{reason.filename}: must be a file that can be written ({reason.strerror})"
+        ) from reason
 
 
 def start(tuning: Tuning) -> Sequence[BaseProcess]:
     """The workers, each on cores of its own."""
     cores = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else []
     context = multiprocessing.get_context("spawn")
-    processes = [context.Process(target=_work, args=(tuning, number, cores[number :: tuning.workers])) for number in range(tuning.workers)]
+    processes = [
+        context.Process(target=_work, args=(tuning, number, cores[number :: tuning.workers]))
+        for number in range(tuning.workers)
+    ]
     for process in processes:
         process.start()
     return processes
@@ -73,10 +82,14 @@ def start(tuning: Tuning) -> Sequence[BaseProcess]:
 def _work(tuning: Tuning, number: int, cores: list[int]) -> None:
     """A worker's life. A group of its own: Ctrl-C reaches the first process only, which passes it on once."""
     os.setpgid(0, 0)
-    signal.signal(signal.SIGINT, signal.SIG_DFL)  # until the worker listens there is nothing to save
+    signal.signal(
+        signal.SIGINT, signal.SIG_DFL
+    )  # until the worker listens there is nothing to save
     if cores:
         os.sched_setaffinity(0, cores)
-    log = os.open(tuning.directory / f"worker-{number}.log", os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o666)
+    log = os.open(
+        tuning.directory / f"worker-{number}.log", os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o666
+    )
     os.dup2(log, 1)
     os.dup2(log, 2)
     terminal.prepare()

@@ -5,8 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from dgae_jax.configs.config import Config
-from dgae_jax.configs.validation import validate
+from dgae_jax.configs.resolved import ResolvedConfig, resolve
 from dgae_jax.run.options import RunOptions
 from dgae_jax.study.search import Space, values_of, with_values
 
@@ -21,7 +20,7 @@ QUARTERS = 4
 class Tuning:
     """One tuning, as every process that works on it knows it."""
 
-    config: Config
+    config: ResolvedConfig
     """Where all settings start that are not searched; its own values are the first trial."""
     space: Space
     directory: Path
@@ -44,19 +43,23 @@ class Tuning:
     @property
     def outside(self) -> dict[str, Any]:
         """The configuration's own values that are not among those searched; with any, it is no trial itself."""
-        return {path: value for path, value in values_of(self.config, self.space).items() if value not in self.space[path]}
+        return {
+            path: value
+            for path, value in values_of(self.config, self.space).items()
+            if value not in self.space[path]
+        }
 
-    def config_of(self, values: dict[str, Any]) -> Config:
+    def config_of(self, values: dict[str, Any]) -> ResolvedConfig:
         """What a trial trains; raises ConfigError if its values do not go together."""
         changed = with_values(self.config, values)
-        return validate(dataclasses.replace(changed, seed=FIRST_SEED, num_seeds=self.seeds))
+        return resolve(dataclasses.replace(changed, seed=FIRST_SEED, num_seeds=self.seeds))
 
-    def best(self, values: dict[str, Any]) -> Config:
+    def best(self, values: dict[str, Any]) -> ResolvedConfig:
         """What is trained with the settings of a trial when the tuning is over."""
-        return validate(dataclasses.replace(with_values(self.config, values), seed=0, num_seeds=1))
+        return resolve(dataclasses.replace(with_values(self.config, values), seed=0, num_seeds=1))
 
 
-def quarter(config: Config) -> int:
+def quarter(config: ResolvedConfig) -> int:
     """Iterations of a quarter of a run."""
     return -(-config.iterations // QUARTERS)
 

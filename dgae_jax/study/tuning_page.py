@@ -52,11 +52,20 @@ def write(tuning: Tuning, study: optuna.Study, best: list[FrozenTrial]) -> None:
     cards = ""
     for picture in PICTURES:
         alike = len({trial.value for trial in best}) < 2  # nothing explains a spread of zero
-        if len(best) < picture.least or (alike and picture.least > 1) or (picture is MAP and len(_pair(tuning)) < 2):
+        if (
+            len(best) < picture.least
+            or (alike and picture.least > 1)
+            or (picture is MAP and len(_pair(tuning)) < 2)
+        ):
             continue
-        image, words = _png(lambda picture=picture: picture.draw(tuning, study)), html.escape(picture.words(tuning, study, best))
+        image, words = (
+            _png(lambda picture=picture: picture.draw(tuning, study)),
+            html.escape(picture.words(tuning, study, best)),
+        )
         files.replace(tuning.directory / f"{picture.name}.png", image)
-        shown = f'<img alt="{words}" src="data:image/png;base64,{base64.b64encode(image).decode()}">'
+        shown = (
+            f'<img alt="{words}" src="data:image/png;base64,{base64.b64encode(image).decode()}">'
+        )
         cards += f"<section><h2>{picture.title}</h2>{shown}<p>{words}</p></section>"
     files.replace(tuning.directory / "tuning.html", _page(tuning, study, best, cards).encode())
 
@@ -99,11 +108,17 @@ def _importances(tuning: Tuning, study: optuna.Study) -> Any:
 def _importances_words(tuning: Tuning, study: optuna.Study, best: list[FrozenTrial]) -> str:
     with unwarned():
         shares = optuna.importance.get_param_importances(study)
-    return "Share of each setting: " + ", ".join(f"{path} {share:.0%}" for path, share in shares.items()) + "."
+    return (
+        "Share of each setting: "
+        + ", ".join(f"{path} {share:.0%}" for path, share in shares.items())
+        + "."
+    )
 
 
 def _map(tuning: Tuning, study: optuna.Study) -> Any:
-    axes = optuna.visualization.matplotlib.plot_contour(study, params=_pair(tuning), target_name=TARGET)
+    axes = optuna.visualization.matplotlib.plot_contour(
+        study, params=_pair(tuning), target_name=TARGET
+    )
     axes.set(title="Return between the trials")
     return axes
 
@@ -134,7 +149,10 @@ def _page(tuning: Tuning, study: optuna.Study, best: list[FrozenTrial], cards: s
     seeds = f"{tuning.seeds} seeds from {FIRST_SEED}" if tuning.seeds > 1 else f"seed {FIRST_SEED}"
     what = f"{config.task}, {config.algo} on {config.physics}: {len(trials)} trials of {config.total_steps:,} steps, {seeds}"
     searched = ", ".join(f"{path} {dimension}" for path, dimension in tuning.space.items())
-    where, episodes = engine_of(config, tuning.options.eval_engine), counted(tuning.options.episodes, "episode")
+    where, episodes = (
+        engine_of(config, tuning.options.eval_engine),
+        counted(tuning.options.episodes, "episode"),
+    )
     measure = f"{TARGET} of {episodes} per seed in {where}, of the policy at the end"
     command = f"dgae train --config {tuning.directory / 'best.json'}"
     return (
@@ -149,7 +167,12 @@ def _page(tuning: Tuning, study: optuna.Study, best: list[FrozenTrial], cards: s
 def _table(tuning: Tuning, trials: list[FrozenTrial]) -> str:
     head = "".join(f"<th>{html.escape(name)}</th>" for name in ("trial", TARGET, *tuning.space))
     rows = "".join(
-        "<tr>" + "".join(f"<td>{html.escape(cell)}</td>" for cell in (str(t.number), f"{t.value:,.1f}", *_settings(tuning, t))) + "</tr>"
+        "<tr>"
+        + "".join(
+            f"<td>{html.escape(cell)}</td>"
+            for cell in (str(t.number), f"{t.value:,.1f}", *_settings(tuning, t))
+        )
+        + "</tr>"
         for t in trials
     )
     return f'<div class="scroll"><table><tr>{head}</tr>{rows}</table></div>'

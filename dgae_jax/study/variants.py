@@ -26,8 +26,8 @@ scale of a loss, but the bound of the gradient's norm, 0.5, does: 32 · 0.5 = 16
 _MONTE_CARLO = "dppo --critic.target monte-carlo --critic.kappa 0.01 --critic.epochs 3"
 
 CALIBRATED = {
-    "monte-carlo-64": f"{_MONTE_CARLO} --num-envs 32 --horizon 64",
-    "monte-carlo-128": f"{_MONTE_CARLO} --num-envs 16 --horizon 128",
+    "monte-carlo-64": f"{_MONTE_CARLO} --num-envs 32 --num-steps 64",
+    "monte-carlo-128": f"{_MONTE_CARLO} --num-envs 16 --num-steps 128",
 }
 """A critic that is told how the return went on, by rollouts of 64 and 128 steps."""
 
@@ -41,7 +41,7 @@ def _noisy(variants: dict[str, str]) -> dict[str, str]:
 
 def _preferences() -> dict[str, str]:
     return {
-        f"{metric.replace(':', '-')}-lambda-{lam}+noise": f"dppo --metric {metric} --lam {lam} {NOISE}"
+        f"{metric.replace(':', '-')}-lambda-{lam}+noise": f"dppo --metric {metric} --gae-lambda {lam} {NOISE}"
         for metric in ("mean", "cvar:0.25")
         for lam in (0.0, 0.5, 0.95, 1.0)
     }

@@ -45,11 +45,19 @@ class View:
     """Shows the cells of a study by task and algorithm: how many are done, run and failed, how far, with what returns."""
 
     def __init__(self, study: Study, cells: Sequence[Cell]):
-        self.study, self.cells, self.state = study, cells, dict.fromkeys((cell.name for cell in cells), "waiting")
+        self.study, self.cells, self.state = (
+            study,
+            cells,
+            dict.fromkeys((cell.name for cell in cells), "waiting"),
+        )
         self.returns: dict[str, float] = {}
         self.began, self.printed = time.monotonic(), time.monotonic()
         self.before = {cell.name: reached(study, cell).steps for cell in cells}
-        self.live = Live(console=Console(file=terminal.Steady(sys.stdout)), auto_refresh=False) if terminal.is_live() else None
+        self.live = (
+            Live(console=Console(file=terminal.Steady(sys.stdout)), auto_refresh=False)
+            if terminal.is_live()
+            else None
+        )
 
     def __enter__(self) -> "View":
         if self.live:
@@ -87,16 +95,32 @@ class View:
 
     def _line(self, far: dict[str, Reached]) -> str:
         count = Counter(self.state.values())
-        parts = [f"{count[state]} {state}" for state in ("done", "running", "waiting", "failed") if count[state]]
+        parts = [
+            f"{count[state]} {state}"
+            for state in ("done", "running", "waiting", "failed")
+            if count[state]
+        ]
         return f"{', '.join(parts)} of {len(self.cells)} cells; {self._left(far)}"
 
     def _left(self, far: dict[str, Reached]) -> str:
         """At the speed so far."""
-        seconds, ours = time.monotonic() - self.began, [cell for cell in self.cells if self.state[cell.name] != "failed"]
-        made = sum((far[cell.name].steps - self.before[cell.name]) * cell.config.num_seeds for cell in ours)
-        total = sum(cell.config.iterations * cell.config.samples_per_iteration * cell.config.num_seeds for cell in ours)
+        seconds, ours = (
+            time.monotonic() - self.began,
+            [cell for cell in self.cells if self.state[cell.name] != "failed"],
+        )
+        made = sum(
+            (far[cell.name].steps - self.before[cell.name]) * cell.config.num_seeds for cell in ours
+        )
+        total = sum(
+            cell.config.iterations * cell.config.samples_per_iteration * cell.config.num_seeds
+            for cell in ours
+        )
         there = sum(far[cell.name].steps * cell.config.num_seeds for cell in ours)
-        left = f"about {clock((total - there) * seconds / made)} left" if made else "time left not known yet"
+        left = (
+            f"about {clock((total - there) * seconds / made)} left"
+            if made
+            else "time left not known yet"
+        )
         return f"{there:,} of {total:,} steps, {left}"
 
     def _table(self, far: dict[str, Reached]) -> Group:
@@ -112,8 +136,19 @@ class View:
 
     def _numbers(self, cells: Sequence[Cell], far: dict[str, Reached]) -> list[str]:
         states = [self.state[cell.name] for cell in cells]
-        share = np.mean([far[cell.name].steps / (cell.config.iterations * cell.config.samples_per_iteration) for cell in cells])
-        found: list[Any] = [self.returns.get(cell.name, far[cell.name].episode_return) for cell in cells]
+        share = np.mean(
+            [
+                far[cell.name].steps / (cell.config.iterations * cell.config.samples_per_iteration)
+                for cell in cells
+            ]
+        )
+        found: list[Any] = [
+            self.returns.get(cell.name, far[cell.name].episode_return) for cell in cells
+        ]
         known = [x for x in found if x is not None]
         shown = f"{np.mean(known):,.0f}" if known else "–"
-        return [*(str(states.count(state) or "") for state in ("done", "running", "failed")), f"{share:.0%}", shown]
+        return [
+            *(str(states.count(state) or "") for state in ("done", "running", "failed")),
+            f"{share:.0%}",
+            shown,
+        ]

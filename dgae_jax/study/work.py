@@ -16,7 +16,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
-from dgae_jax.configs.config import Config, ConfigError
+from dgae_jax.configs.config import ConfigError
+from dgae_jax.configs.resolved import ResolvedConfig
 from dgae_jax.run import terminal
 from dgae_jax.run.directory import InUseError
 from dgae_jax.run.options import RunOptions, from_dict, to_dict
@@ -39,11 +40,23 @@ def run(job: Job, cores: Sequence[int] = (), lifeline: int = subprocess.PIPE) ->
 
     It stops when the other end of `lifeline` is closed: by default, when this process ends.
     """
-    options = json.dumps({**to_dict(job.options), "cache_dir": job.options.cache_dir, "inexact": job.options.inexact})
-    words = [sys.executable, "-m", __name__, str(job.study.path.absolute()), job.cell.name, options, *map(str, cores)]
+    options = json.dumps(
+        {**to_dict(job.options), "cache_dir": job.options.cache_dir, "inexact": job.options.inexact}
+    )
+    words = [
+        sys.executable,
+        "-m",
+        __name__,
+        str(job.study.path.absolute()),
+        job.cell.name,
+        options,
+        *map(str, cores),
+    ]
     with job.study.log(job.cell).open("ab") as log:
         # a session of its own: Ctrl-C comes to whoever started it, who stops it
-        process = subprocess.Popen(words, stdin=lifeline, stdout=log, stderr=log, start_new_session=True)
+        process = subprocess.Popen(
+            words, stdin=lifeline, stdout=log, stderr=log, start_new_session=True
+        )
     with process:
         return process.wait()
 
@@ -70,7 +83,7 @@ def _stop_when_left() -> None:
     os.kill(os.getpid(), signal.SIGTERM)
 
 
-def _train(config: Config, options: RunOptions) -> int:
+def _train(config: ResolvedConfig, options: RunOptions) -> int:
     from dgae_jax.run import loop
 
     since = time.monotonic()

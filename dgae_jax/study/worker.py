@@ -45,7 +45,11 @@ def _serve(tuning: Tuning, study: optuna.Study, storage: RDBStorage) -> int:
                 time.sleep(POLL)
                 continue
             with alive(study, storage, taken, tuning.heartbeat):
-                code = _together(tuning, study, taken, signals) if tuning.side_by_side > 1 else _one(tuning, study, taken[0])
+                code = (
+                    _together(tuning, study, taken, signals)
+                    if tuning.side_by_side > 1
+                    else _one(tuning, study, taken[0])
+                )
             if code:
                 return code
         return signals.exit_code if signals.received else 0

@@ -30,7 +30,7 @@ Every setting of a run, written by `python -m docs.site.configuration` from the 
 `Config` decides the result, [`RunOptions`](#what-a-run-leaves) what the run leaves on the machine. A setting that is *unset* (None)
 is filled in by the algorithm or the task; one that the run's parts do not use must stay unset and is refused otherwise.
 
-The path of a setting in Python is its flag, with underscores or dashes: `Config(policy=PolicyConfig(clip=0.3))` is `--policy.clip 0.3`.
+The path of a setting in Python is its flag, with underscores or dashes: `Config(policy=PolicyConfig(clip=0.3))` is `--policy.clip_eps-eps 0.3`.
 Where the default is `True` or `False`, the flag is written `--name` or `--no-name`.
 
 Settings start from a preset (`--preset`, `dgae_jax.preset`), from a file (`--config`) or, in Python, from `dgae_jax.Config()`; flags
@@ -58,11 +58,22 @@ def page() -> str:
 
 
 def _fields(
-    cls: type, prefix: str = "", skip: tuple[str, ...] = (), only: list[str] | None = None, allowed: Mapping[str, Any] = validation.WHOLE
+    cls: type,
+    prefix: str = "",
+    skip: tuple[str, ...] = (),
+    only: list[str] | None = None,
+    allowed: Mapping[str, Any] = validation.WHOLE,
 ) -> str:
-    said = {name: text for each in reversed(cls.__mro__) for name, text in _docstrings(each).items()}
+    said = {
+        name: text for each in reversed(cls.__mro__) for name, text in _docstrings(each).items()
+    }
     rows = [
-        (f"`{flag(prefix + f.name)}`", _shown(_default(f)), _allowed(prefix + f.name, allowed), said[f.name])
+        (
+            f"`{flag(prefix + f.name)}`",
+            _shown(_default(f)),
+            _allowed(prefix + f.name, allowed),
+            said[f.name],
+        )
         for f in dataclasses.fields(cls)
         if f.name not in skip and (only is None or f.name in only)
     ]
@@ -103,8 +114,17 @@ def _allowed(path: str, whole: Mapping[str, Any]) -> str:
 
 
 def _algorithms() -> str:
-    header = ("`--algo`", "`--critic.kind`", "`--residual`", "`--critic.target`", "`--policy.update`")
-    return _table(header, [(f"`{name}`", *(f"`{part}`" for part in row)) for name, row in algorithms.TABLE.items()])
+    header = (
+        "`--algo`",
+        "`--critic.kind`",
+        "`--residual`",
+        "`--critic.target`",
+        "`--policy.update`",
+    )
+    return _table(
+        header,
+        [(f"`{name}`", *(f"`{part}`" for part in row)) for name, row in algorithms.TABLE.items()],
+    )
 
 
 def _filled() -> str:
@@ -112,8 +132,15 @@ def _filled() -> str:
     for group, table in TABLES.items():
         for name, part in table.items():
             settings = {**(parts.DESCENT if group == "critic" else {}), **part.options}
-            shown = ", ".join(f"`{flag(f'{group}.{key}')} {value}`" for key, value in settings.items())
-            rows.append((f"`{flag(group + '.' + ('update' if group == 'policy' else 'kind'))} {name}`", shown))
+            shown = ", ".join(
+                f"`{flag(f'{group}.{key}')} {value}`" for key, value in settings.items()
+            )
+            rows.append(
+                (
+                    f"`{flag(group + '.' + ('update' if group == 'policy' else 'kind'))} {name}`",
+                    shown,
+                )
+            )
     return _table(("part", "settings"), rows)
 
 
@@ -124,13 +151,18 @@ def _presets() -> str:
     for name in PRESETS:
         where: dict[str, list[tuple[str, str]]] = {}
         for algo, env in cells:
-            for path, value in _changed(preset(name, algo, env), Config(env=env, algo=algo)).items():
+            for path, value in _changed(
+                preset(name, algo, env), Config(env=env, algo=algo)
+            ).items():
                 where.setdefault(f"`{flag(path)} {_word(value)}`", []).append((algo, env))
         settings: dict[tuple[tuple[str, str], ...], list[str]] = {}
         for setting, found in where.items():
             for block in _blocks(found):
                 settings.setdefault(block, []).append(setting)
-        rows += [(f"`{name}`", *_cells(found), ", ".join(settings[found])) for found in sorted(settings, key=len, reverse=True)]
+        rows += [
+            (f"`{name}`", *_cells(found), ", ".join(settings[found]))
+            for found in sorted(settings, key=len, reverse=True)
+        ]
     return _table(("`--preset`", "algorithms", "tasks", "sets"), rows)
 
 
@@ -148,12 +180,17 @@ def _changed(config: Any, start: Any, prefix: str = "") -> dict[str, Any]:
 def _blocks(cells: Sequence[tuple[str, str]]) -> list[tuple[tuple[str, str], ...]]:
     """The cells as blocks of some algorithms × some tasks: algorithms with the same tasks are one."""
     tasks_of = {algo: tuple(env for other, env in cells if other == algo) for algo, _ in cells}
-    return [tuple((a, env) for a, env in cells if tasks_of[a] == tasks) for tasks in dict.fromkeys(tasks_of.values())]
+    return [
+        tuple((a, env) for a, env in cells if tasks_of[a] == tasks)
+        for tasks in dict.fromkeys(tasks_of.values())
+    ]
 
 
 def _cells(cells: Sequence[tuple[str, str]]) -> tuple[str, str]:
     algos, tasks = (list(dict.fromkeys(each)) for each in zip(*cells, strict=True))
-    return ("all" if len(algos) == len(algorithms.TABLE) else ", ".join(algos)), ("all" if len(tasks) == len(TASKS) else ", ".join(tasks))
+    return ("all" if len(algos) == len(algorithms.TABLE) else ", ".join(algos)), (
+        "all" if len(tasks) == len(TASKS) else ", ".join(tasks)
+    )
 
 
 def _shown(value: Any) -> str:
@@ -161,12 +198,23 @@ def _shown(value: Any) -> str:
 
 
 def _word(value: Any) -> str:
-    return " ".join(map(str, value)) if isinstance(value, tuple) else f"{value:_}" if type(value) is int else str(value)
+    return (
+        " ".join(map(str, value))
+        if isinstance(value, tuple)
+        else f"{value:_}"
+        if type(value) is int
+        else str(value)
+    )
 
 
 def _table(header: tuple[str, ...], rows: list[tuple[str, ...]]) -> str:
     lines = [header, ("---",) * len(header), *rows]
-    return "\n".join("| " + " | ".join(cell.replace("|", "\\|") for cell in line) + " |" for line in lines) + "\n"
+    return (
+        "\n".join(
+            "| " + " | ".join(cell.replace("|", "\\|") for cell in line) + " |" for line in lines
+        )
+        + "\n"
+    )
 
 
 if __name__ == "__main__":

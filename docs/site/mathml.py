@@ -16,5 +16,7 @@ def block(source: str, *_: Any, **__: Any) -> str:
     formula = convert(source, display="block")
     unknown = re.findall(r"\\\w+|>&<", formula)
     if unknown:
-        raise SuperFencesException(f"a formula with {', '.join(unknown)}, which latex2mathml does not know:\n{source}")
+        raise SuperFencesException(
+            f"a formula with {', '.join(unknown)}, which latex2mathml does not know:\n{source}"
+        )
     return f'<div class="formula">{formula}</div>'

@@ -17,6 +17,8 @@ class Shapes(griffe.Extension):
         arguments = node.args
         for argument in (*arguments.posonlyargs, *arguments.args, *arguments.kwonlyargs):
             if argument.annotation:
-                func.parameters[argument.arg].annotation = griffe.get_expression(argument.annotation, scope, parse_strings=False)
+                func.parameters[argument.arg].annotation = griffe.get_expression(
+                    argument.annotation, scope, parse_strings=False
+                )
         if node.returns:
             func.returns = griffe.get_expression(node.returns, scope, parse_strings=False)

@@ -48,7 +48,12 @@ def trained(tmp_path_factory):
         *TINY,
     ]
     done = subprocess.run(
-        [sys.executable, "experiments/train.py", *argv], cwd=ROOT, capture_output=True, text=True, check=True, timeout=300
+        [sys.executable, "experiments/train.py", *argv],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        check=True,
+        timeout=300,
     )
     return directory, done.stdout.splitlines(), done.stderr
 
@@ -96,12 +101,23 @@ def test_checkpoints_are_saved_and_evaluated_along_the_way_and_at_the_end(traine
     assert [row["steps"] for row in evaluations] == [256, 512, 768, 960]
     best = max(evaluations[:-1], key=lambda row: (row["return_mean"], row["steps"]))["steps"]
     kept = sorted({best, 512, 768, 960})
-    assert [p.name for p in sorted((directory / "checkpoints").iterdir())] == [f"steps_{steps:012d}.msgpack" for steps in kept]
+    assert [p.name for p in sorted((directory / "checkpoints").iterdir())] == [
+        f"steps_{steps:012d}.msgpack" for steps in kept
+    ]
 
 
 def test_the_best_checkpoint_is_evaluated_if_asked_for(trained, run, tmp_path):
     rows = metrics.read(trained[0] / "evaluations.jsonl")
-    code, _, _ = run("evaluate", trained[0], "--checkpoint", "best", "--episodes", 3, "--out", tmp_path / "best.json")
+    code, _, _ = run(
+        "evaluate",
+        trained[0],
+        "--checkpoint",
+        "best",
+        "--episodes",
+        3,
+        "--out",
+        tmp_path / "best.json",
+    )
     result = json.loads((tmp_path / "best.json").read_text())
     assert code == 0
     assert result["return_mean"] == pytest.approx(max(row["return_mean"] for row in rows))
@@ -116,7 +132,9 @@ def test_evaluate_loads_a_run_and_writes_json(engine, trained, run):
     result = json.loads((directory / f"evaluation-{engine}.json").read_text())
     assert result["engine"] == engine
     assert len(result["returns"]) == 4
-    assert f"return {result['return_mean']:,.1f} ± {result['return_std']:,.1f} over 4 episodes" in out
+    assert (
+        f"return {result['return_mean']:,.1f} ± {result['return_std']:,.1f} over 4 episodes" in out
+    )
 
 
 def test_evaluating_twice_gives_the_same_returns(trained, run, tmp_path):
@@ -124,17 +142,21 @@ def test_evaluating_twice_gives_the_same_returns(trained, run, tmp_path):
     for name in ("a.json", "b.json"):
         run("evaluate", trained[0], "--episodes", 3, "--out", tmp_path / name)
         results.append(json.loads((tmp_path / name).read_text())["returns"])
-    assert results[0] == results[1] == json.loads((trained[0] / "evaluation.json").read_text())["returns"]
+    assert (
+        results[0]
+        == results[1]
+        == json.loads((trained[0] / "evaluation.json").read_text())["returns"]
+    )
 
 
 @pytest.mark.parametrize(
     ("argv", "message"),
     [
         (["--foo", "3"], r"--foo: is not a flag of this command"),
-        (["--policy.clp", "3"], r"--policy.clp: is not a flag of this command; perhaps --policy.clip"),
+        (["--policy.clp", "3"], r"--policy.clp: is not a flag of this command; perhaps --policy.clip_eps-eps"),
         (["--num-envs", "many"], r"--num-envs many: must be a whole number"),
         (["--num-envs"], r"--num-envs"),
-        (["--policy.minibatches", "7"], r"--policy.minibatches 7: must be a divisor of num_envs \* horizon = 2,048"),
+        (["--policy.minibatches", "7"], r"--policy.minibatches 7: must be a divisor of num_envs \* num_steps = 2,048"),
         (["--env", "hoper"], r"--env hoper: must be one of ant, hopper, swimmer, walker2d"),
         (["--run-dir", "/dev/null/below"], r"--run-dir /dev/null/below: must be a directory that can be written"),
         (["--cache-dir", "/dev/null/below"], r"--cache-dir /dev/null/below: must be a directory that can be written, or none"),
@@ -143,7 +165,7 @@ def test_evaluating_twice_gives_the_same_returns(trained, run, tmp_path):
         (["--resume", "x" * 300], r"x+: must be a run directory, or the file of a policy \(File name too long\)"),
         (["--resume-or-start", "--run-dir", "x" * 300], r"--run-dir x+: must be a directory that can be written \(File name too long\)"),
         (["--inexact"], r"--inexact True: must be left out without --resume"),
-        (["--num-envs", "1e9", "--horizon", "1", "--policy.minibatches", "1", "--critic.minibatches", "1", "--total-steps", "1e9"],
+        (["--num-envs", "1e9", "--num-steps", "1", "--policy.minibatches", "1", "--critic.minibatches", "1", "--total-steps", "1e9"],
          r"--num-envs 1000000000: must be smaller: the run needs at least [\d,.]+ GiB of memory, and there are [\d.,]+ GiB"),
         (["--policy.hidden", *["8"] * 1000], r"--policy.hidden of 1,000 layers: must be at most 32"),
     ],
@@ -168,15 +190,35 @@ def test_a_used_run_directory_is_refused_and_left_alone(trained, run):
 @pytest.mark.parametrize(
     ("argv", "message"),
     [
-        (["--resume", "RUN", "--preset", "paper"], r"--preset paper: must be left out: all settings start from RUN"),
-        (["--resume", "RUN", "--config", "FILE"], r"--config FILE: must be left out: all settings start from RUN"),
-        (["--config", "FILE", "--algo", "ppo"], r"--algo ppo: must be dppo as in FILE, or left out"),
-        (["--config", "FILE", "--preset", "paper"], r"--preset paper: must be left out: all settings start from FILE"),
-        (["--resume", "RUN", "--run-dir", "there"], r"--run-dir there: must be left out: --resume writes to RUN"),
-        (["--resume", "RUN", "--gamma", "0.5"], r"--gamma 0\.5: must be 0\.995 as in RUN, or left out"),
+        (
+            ["--resume", "RUN", "--preset", "paper"],
+            r"--preset paper: must be left out: all settings start from RUN",
+        ),
+        (
+            ["--resume", "RUN", "--config", "FILE"],
+            r"--config FILE: must be left out: all settings start from RUN",
+        ),
+        (
+            ["--config", "FILE", "--algo", "ppo"],
+            r"--algo ppo: must be dppo as in FILE, or left out",
+        ),
+        (
+            ["--config", "FILE", "--preset", "paper"],
+            r"--preset paper: must be left out: all settings start from FILE",
+        ),
+        (
+            ["--resume", "RUN", "--run-dir", "there"],
+            r"--run-dir there: must be left out: --resume writes to RUN",
+        ),
+        (
+            ["--resume", "RUN", "--gamma", "0.5"],
+            r"--gamma 0\.5: must be 0\.995 as in RUN, or left out",
+        ),
     ],
 )
-def test_flags_that_would_have_no_effect_are_refused(argv, message, trained, run, monkeypatch, tmp_path):
+def test_flags_that_would_have_no_effect_are_refused(
+    argv, message, trained, run, monkeypatch, tmp_path
+):
     monkeypatch.chdir(tmp_path)
     places = {"RUN": str(trained[0]), "FILE": str(trained[0] / "config.json")}
     code, out, err = run("train", *(places.get(word, word) for word in argv), "--cache-dir", "none")
@@ -197,7 +239,10 @@ except SystemExit as stop:
     print(stop.code, [name for name in ("jax", "mujoco", "brax", "flax", "gymnasium", "matplotlib") if name in sys.modules])
 """
     done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True)
-    assert (done.stdout, done.stderr) == ("2 []\n", "error: --gamma 1.5: must be a number from 0 to 1\n")
+    assert (done.stdout, done.stderr) == (
+        "2 []\n",
+        "error: --gamma 1.5: must be a number from 0 to 1\n",
+    )
 
 
 def test_dgae_runs_a_command_by_name_and_names_them_all(monkeypatch, capsys):
@@ -213,10 +258,17 @@ def test_dgae_runs_a_command_by_name_and_names_them_all(monkeypatch, capsys):
         2,
         "error: --episodes 0: must be a whole number from 1 to 10,000 (they are played side by side)\n",
     )
-    assert dgae("trian") == (2, "", f"error: trian: must be one of {', '.join(COMMANDS)}; perhaps train\n")
+    assert dgae("trian") == (
+        2,
+        "",
+        f"error: trian: must be one of {', '.join(COMMANDS)}; perhaps train\n",
+    )
     code, out, err = dgae("--help")
     assert (code, err) == (0, "")
-    assert all(re.search(rf"^  {name} ", out, re.MULTILINE) for name in ("train", "evaluate", "render", "figures"))
+    assert all(
+        re.search(rf"^  {name} ", out, re.MULTILINE)
+        for name in ("train", "evaluate", "render", "figures")
+    )
 
 
 def test_a_device_that_is_not_there_is_refused_in_one_line(tmp_path):
@@ -225,7 +277,10 @@ def test_a_device_that_is_not_there_is_refused_in_one_line(tmp_path):
         env={**os.environ, "JAX_PLATFORMS": "abacus"},
     )  # fmt: skip
     assert (done.returncode, done.stdout) == (2, "")
-    assert re.fullmatch(r"error: JAX_PLATFORMS=abacus: must name a device that JAX finds here, .*; an NVIDIA GPU needs .*\n", done.stderr)
+    assert re.fullmatch(
+        r"error: JAX_PLATFORMS=abacus: must name a device that JAX finds here, .*; an NVIDIA GPU needs .*\n",
+        done.stderr,
+    )
     assert not (tmp_path / "run").exists()
 
 
@@ -243,14 +298,18 @@ def test_a_command_that_leaves_a_compiler_to_itself_ends_before_that_aborts_it(m
 
 
 @pytest.mark.parametrize(("name", "work"), [("train", "parsed"), ("evaluate", "parse")])
-def test_an_interrupt_where_nothing_is_at_stake_ends_with_130_and_one_line(name, work, trained, run, monkeypatch, tmp_path):
+def test_an_interrupt_where_nothing_is_at_stake_ends_with_130_and_one_line(
+    name, work, trained, run, monkeypatch, tmp_path
+):
     def interrupted(*_, **__):
         raise KeyboardInterrupt
 
     main = command(name)
     monkeypatch.setitem(main.__globals__, work, interrupted)
     monkeypatch.setattr(sys.modules[__name__], "command", lambda _: main)
-    code, out, err = run(name, *([trained[0]] if name == "evaluate" else ["--run-dir", tmp_path / "run"]))
+    code, out, err = run(
+        name, *([trained[0]] if name == "evaluate" else ["--run-dir", tmp_path / "run"])
+    )
     assert (code, out) == (130, "")
     assert re.fullmatch(r"stopped by SIGINT.*\n", err)
 
@@ -261,15 +320,23 @@ def test_a_resumed_run_starts_from_its_own_flags(trained):
     assert (options.checkpoint_every, options.episodes, options.keep_checkpoints) == (300, 5, 3)
 
 
-def test_viewers_are_named_behind_one_flag_and_a_missing_one_is_refused_in_one_line_that_says_what_to_install(run, monkeypatch, tmp_path):
+def test_viewers_are_named_behind_one_flag_and_a_missing_one_is_refused_in_one_line_that_says_what_to_install(
+    run, monkeypatch, tmp_path
+):
     assert parsed(["--log", "tensorboard"])[1].log == ("tensorboard",)
     assert parsed(["--log", "--env", "hopper"])[1].log == ()
     monkeypatch.setitem(SINKS, "wandb", "a_library_that_nobody_has")
     code, out, err = run("train", "--log", "tensorboard", "wandb", "--run-dir", tmp_path / "run")
     assert (code, out) == (2, "")
-    assert err == 'error: --log wandb: a_library_that_nobody_has is missing; pip install "dgae_jax[wandb]"\n'
+    assert (
+        err
+        == 'error: --log wandb: a_library_that_nobody_has is missing; pip install "dgae_jax[wandb]"\n'
+    )
     code, _, err = run("train", "--log", "visdom")
-    assert (code, err) == (2, "error: --log visdom: must be one or more of tensorboard, wandb, mlflow\n")
+    assert (code, err) == (
+        2,
+        "error: --log visdom: must be one or more of tensorboard, wandb, mlflow\n",
+    )
     assert not (tmp_path / "run").exists()
 
 
@@ -278,7 +345,10 @@ def test_an_output_that_is_no_file_is_left_alone(trained, run, tmp_path):
     (tmp_path / "link").symlink_to(tmp_path / "pipe")
     for name in ("pipe", "link", "."):
         code, _, err = run("evaluate", trained[0], "--out", tmp_path / name)
-        assert (code, err) == (2, f"error: --out {tmp_path / name}: must be a file, not a directory, a link or a device\n")
+        assert (code, err) == (
+            2,
+            f"error: --out {tmp_path / name}: must be a file, not a directory, a link or a device\n",
+        )
     assert (tmp_path / "pipe").is_fifo()
 
 
@@ -301,15 +371,17 @@ def test_evaluate_refuses_bad_input_in_one_line(argv, message, run, monkeypatch,
 def test_help_explains_every_flag(run):
     code, out, _ = run("train", "--help")
     assert code == 0
-    for flag in ("--env", "--algo", "--physics", "--seed", "--num-seeds", "--total-steps", "--num-envs", "--gamma", "--lam", "--run-dir",
-                 "--cache-dir", "--critic.target", "--policy.clip"):  # fmt: skip
+    for flag in ("--env", "--algo", "--physics", "--seed", "--num-seeds", "--total-steps", "--num-envs", "--gamma", "--gae-lambda", "--run-dir",
+                 "--cache-dir", "--critic.target", "--policy.clip_eps-eps"):  # fmt: skip
         assert re.search(rf"{flag}\b", out)
 
 
 @pytest.mark.parametrize(("kind", "code"), [(signal.SIGTERM, 143), (signal.SIGINT, 130)])
 def test_a_signal_saves_a_checkpoint_and_ends_with_its_code(kind, code, tmp_path):
     argv = ["--total-steps", "100_000_000", "--run-dir", str(tmp_path / "run"), *TINY]
-    process = subprocess.Popen([sys.executable, "experiments/train.py", *argv], cwd=ROOT, stdout=subprocess.PIPE, text=True)
+    process = subprocess.Popen(
+        [sys.executable, "experiments/train.py", *argv], cwd=ROOT, stdout=subprocess.PIPE, text=True
+    )
     lines = tmp_path / "run" / "metrics.jsonl"
     deadline = time.monotonic() + 120
     while not (lines.exists() and lines.stat().st_size) and time.monotonic() < deadline:
@@ -325,7 +397,11 @@ def test_a_signal_saves_a_checkpoint_and_ends_with_its_code(kind, code, tmp_path
 def test_importing_the_package_pulls_in_no_plotting_no_gymnasium_no_web_server_and_prints_nothing():
     code = "import dgae_jax, sys; print([m for m in ('matplotlib', 'gymnasium', 'flask', 'tyro', 'IPython') if m in sys.modules])"
     done = subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, text=True, check=True, env={**os.environ, "JAX_PLATFORMS": "cpu"}
+        [sys.executable, "-c", code],
+        capture_output=True,
+        text=True,
+        check=True,
+        env={**os.environ, "JAX_PLATFORMS": "cpu"},
     )
     assert done.stdout == "[]\n"
 

@@ -20,7 +20,13 @@ def complete(tmp_path_factory):
     program = 'source dgae.bash; COMP_WORDS=("$@"); COMP_CWORD=$(($# - 1)); _dgae; printf "%s\\n" "${COMPREPLY[@]}"'
 
     def complete(*words):
-        done = subprocess.run(["bash", "-c", program, "bash", *words], cwd=place, capture_output=True, text=True, check=True)
+        done = subprocess.run(
+            ["bash", "-c", program, "bash", *words],
+            cwd=place,
+            capture_output=True,
+            text=True,
+            check=True,
+        )
         assert done.stderr == ""
         return done.stdout.splitlines()
 
@@ -42,7 +48,9 @@ def test_bash_completes_commands_flags_names_and_files(complete):
 
 
 @pytest.mark.parametrize(("shell", "check"), [("zsh", ["zsh", "-n"]), ("fish", ["fish", "-n"])])
-def test_the_scripts_of_other_shells_are_of_their_language_and_know_all_commands(shell, check, tmp_path):
+def test_the_scripts_of_other_shells_are_of_their_language_and_know_all_commands(
+    shell, check, tmp_path
+):
     text = completion.script(shell, main.COMMANDS)
     assert all(f"'{name}'" in text for name in main.COMMANDS)
     (tmp_path / "dgae").write_text(text)
@@ -52,5 +60,7 @@ def test_the_scripts_of_other_shells_are_of_their_language_and_know_all_commands
 
 @pytest.mark.parametrize("setting", completion.NAMES)
 def test_names_that_are_offered_are_of_flags_that_exist(setting):
-    everything = [leaf for cls in (completion.leaves_of(name) for name in main.COMMANDS) for leaf in cls]
+    everything = [
+        leaf for cls in (completion.leaves_of(name) for name in main.COMMANDS) for leaf in cls
+    ]
     assert setting.replace("_", "-") in {leaf.flag for leaf in everything}

@@ -14,26 +14,49 @@ import dgae_jax as dg
 from dgae_jax.cli.arguments import fail
 from dgae_jax.cli.train import parsed
 from dgae_jax.configs.config import ConfigError
+from dgae_jax.configs.resolved import resolve
 from dgae_jax.configs.serial import from_dict, to_dict
-from dgae_jax.configs.validation import validate
 from dgae_jax.run import checkpoint, files, manifest, metrics
 from dgae_jax.run.checkpoint import CheckpointError
 from dgae_jax.run.evaluations import EvaluationsFile
 from dgae_jax.run.options import RunOptions
 from tests.helpers import signed
 
-many = settings(max_examples=600, deadline=None, suppress_health_check=list(HealthCheck), derandomize=True)
+many = settings(
+    max_examples=600, deadline=None, suppress_health_check=list(HealthCheck), derandomize=True
+)
 PLAIN = st.recursive(
     st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=8),
-    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(max_size=8), inner, max_size=3),
+    lambda inner: (
+        st.lists(inner, max_size=3) | st.dictionaries(st.text(max_size=8), inner, max_size=3)
+    ),
     max_leaves=6,
 )
-NAMES = sorted(to_dict(dg.Config())) + sorted(to_dict(dg.Config())["policy"]) + sorted(to_dict(dg.Config())["critic"])
+NAMES = (
+    sorted(to_dict(dg.Config()))
+    + sorted(to_dict(dg.Config())["policy"])
+    + sorted(to_dict(dg.Config())["critic"])
+)
 FLAGS = ["--" + part + name.replace("_", "-") for name in NAMES for part in ("", "policy.", "critic.", "noise.")] + [
     "--preset", "--config", "--run-dir", "--resume", "--resume-or-start", "--episodes", "--checkpoint-every", "--keep-checkpoints",
     "--inexact", "--max-nonfinite", "--", "-h2", "--no-diagnostics",
 ]  # fmt: skip
-WORDS = st.sampled_from([*FLAGS, "ppo", "dtrpo", "hopper", "brax:ant", "brax:", "cvar:0.1", "nan", "inf", "-1", "1e400", "True"])
+WORDS = st.sampled_from(
+    [
+        *FLAGS,
+        "ppo",
+        "dtrpo",
+        "hopper",
+        "brax:ant",
+        "brax:",
+        "cvar:0.1",
+        "nan",
+        "inf",
+        "-1",
+        "1e400",
+        "True",
+    ]
+)
 
 
 @many
@@ -65,24 +88,43 @@ def changed(data, path, value):
     return copy
 
 
-PATHS = [(k,) for k in to_dict(dg.Config())] + [(p, k) for p in ("policy", "critic", "noise") for k in to_dict(dg.Config())[p]]
+PATHS = [(k,) for k in to_dict(dg.Config())] + [
+    (p, k) for p in ("policy", "critic", "noise") for k in to_dict(dg.Config())[p]
+]
 
 
 @pytest.mark.parametrize("name", ["gamma", "total_steps", "seed"])
 def test_a_number_of_four_hundred_digits_is_refused(name):
     with pytest.raises(ConfigError, match=name.replace("_", "[-_]")):
-        validate(from_dict({**to_dict(dg.Config()), name: 10**400}))
+        resolve(from_dict({**to_dict(dg.Config()), name: 10**400}))
 
 
 @many
-@given(st.one_of(PLAIN, st.builds(lambda path, value: changed(to_dict(dg.Config()), path, value), st.sampled_from(PATHS), PLAIN)))
+@given(
+    st.one_of(
+        PLAIN,
+        st.builds(
+            lambda path, value: changed(to_dict(dg.Config()), path, value),
+            st.sampled_from(PATHS),
+            PLAIN,
+        ),
+    )
+)
 def test_any_json_is_a_configuration_or_refused(data):
     with contextlib.suppress(ConfigError):
-        validate(from_dict(data))
+        resolve(from_dict(data))
 
 
 ROWS = files.json_lines(
-    {"iteration": i, "steps": 10 * i, "seed": 0, "seconds": 1.0, "episode_return": 1.5, "return_mean": 1, "return_std": 0}
+    {
+        "iteration": i,
+        "steps": 10 * i,
+        "seed": 0,
+        "seconds": 1.0,
+        "episode_return": 1.5,
+        "return_mean": 1,
+        "return_std": 0,
+    }
     for i in range(1, 6)
 )
 
@@ -113,7 +155,13 @@ def test_any_bytes_are_evaluations_as_far_as_they_are_rows(tmp_path_factory, cut
 
 
 MANIFEST = st.fixed_dictionaries(
-    {}, optional={"resumed": PLAIN | st.lists(PLAIN, max_size=2), "versions": PLAIN, "device": PLAIN, "cores": PLAIN}
+    {},
+    optional={
+        "resumed": PLAIN | st.lists(PLAIN, max_size=2),
+        "versions": PLAIN,
+        "device": PLAIN,
+        "cores": PLAIN,
+    },
 )
 
 
@@ -129,16 +177,23 @@ def test_any_manifest_is_another_machine_and_can_be_added_to(tmp_path_factory, d
 
 BODY = msgpack.packb(
     {
-        "arrays": {"a": msgpack.ExtType(checkpoint.ARRAY, msgpack.packb(((2,), "float32", bytes(8)))), "b": True},
+        "arrays": {
+            "a": msgpack.ExtType(checkpoint.ARRAY, msgpack.packb(((2,), "float32", bytes(8)))),
+            "b": True,
+        },
         "config": json.dumps(to_dict(dg.Config())),
     }
 )
-FRONT = st.integers(0, 120)  # the arrays, the beginning of the configuration, and the header where there is one
+FRONT = st.integers(
+    0, 120
+)  # the arrays, the beginning of the configuration, and the header where there is one
 
 
 @many
 @given(st.booleans(), FRONT, st.binary(max_size=60), FRONT | st.integers(0, len(BODY)))
-def test_any_bytes_are_a_checkpoint_or_refused_whether_they_carry_a_checksum_or_not(tmp_path_factory, honest, at, noise, rest):
+def test_any_bytes_are_a_checkpoint_or_refused_whether_they_carry_a_checksum_or_not(
+    tmp_path_factory, honest, at, noise, rest
+):
     path = tmp_path_factory.mktemp("checkpoints") / "steps_000000000001.msgpack"
     body = BODY[:at] + noise + BODY[rest:]
     path.write_bytes(signed(body) if honest else (signed(BODY)[:at] + noise + signed(BODY)[rest:]))

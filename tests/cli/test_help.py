@@ -56,13 +56,27 @@ def test_the_help_lists_every_flag_once_with_its_text_and_its_default(name, dgae
         shown = leaf.flag.upper().replace("-", "_") if leaf.positional else "--" + leaf.flag
         assert leaf.text
         assert out.count(f"{leaf.text} (") >= 1, leaf.flag
-        assert re.search(rf"{shown}\b[^(]*{re.escape(leaf.text)} \((default: .+?|unset|required)\)", out), leaf.flag
+        assert re.search(
+            rf"{shown}\b[^(]*{re.escape(leaf.text)} \((default: .+?|unset|required)\)", out
+        ), leaf.flag
 
 
 def test_settings_stand_below_headings_with_the_defaults_of_the_algorithm_that_is_named(dgae):
     _, out, _ = dgae("train", "--algo", "trpo", "--help")
     headings = re.findall(r"^[^\w\n]*(?:(\w+) )?options[^\w\n]*$", out, re.MULTILINE)
-    assert headings == ["", "task", "noise", "algorithm", "rollout", "policy", "critic", "run", "evaluation", "device", "diagnostics"]
+    assert headings == [
+        "",
+        "task",
+        "noise",
+        "algorithm",
+        "rollout",
+        "policy",
+        "critic",
+        "run",
+        "evaluation",
+        "device",
+        "diagnostics",
+    ]
     words = " ".join(out.split())
     assert "summed over the action's dimensions [nats]. (default: 0.03)" in words
     assert "never exceeded [environment steps]. (default: 1_000_000)" in words
@@ -81,7 +95,9 @@ def parsed(name, argv, monkeypatch):
     return parse(MODULES[name].Arguments, "", argv)
 
 
-@pytest.mark.parametrize("line", [line for module in (main, *MODULES.values()) for line in module.EXAMPLES])
+@pytest.mark.parametrize(
+    "line", [line for module in (main, *MODULES.values()) for line in module.EXAMPLES]
+)
 def test_an_example_is_a_command_line_that_is_understood(line, monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
     program, name, *argv = shlex.split(line)
@@ -104,18 +120,31 @@ for argv in (["--help"], ["--version"], *([name, "--help"] for name in sys.argv[
     heavy = [name for name in ("jax", "mujoco", "brax", "flax", "gymnasium", "matplotlib", "optuna") if name in sys.modules]
     assert not heavy, (argv, heavy)
 """
-    done = subprocess.run([sys.executable, "-c", code, *COMMANDS], cwd=ROOT, capture_output=True, text=True)
+    done = subprocess.run(
+        [sys.executable, "-c", code, *COMMANDS], cwd=ROOT, capture_output=True, text=True
+    )
     assert (done.returncode, done.stderr) == (0, "")
-    assert re.search(r"^dgae_jax [\d.]+\nPython [\d.]+, jax [\d.]+, mujoco [\d.]+", done.stdout, re.MULTILINE)
+    assert re.search(
+        r"^dgae_jax [\d.]+\nPython [\d.]+, jax [\d.]+, mujoco [\d.]+", done.stdout, re.MULTILINE
+    )
 
 
 @pytest.mark.parametrize(
-    ("environment", "colours"), [({"TERM": "xterm"}, True), ({"TERM": "dumb"}, False), ({"TERM": "xterm", "NO_COLOR": "1"}, False)]
+    ("environment", "colours"),
+    [
+        ({"TERM": "xterm"}, True),
+        ({"TERM": "dumb"}, False),
+        ({"TERM": "xterm", "NO_COLOR": "1"}, False),
+    ],
 )
 def test_a_terminal_has_colours_where_it_can_and_may(environment, colours):
     ours, theirs = pty.openpty()
     program = [sys.executable, "-m", "dgae_jax.cli.main", "figures", "--help"]
-    variables = {**{k: v for k, v in os.environ.items() if k != "NO_COLOR"}, "COLUMNS": "80", **environment}
+    variables = {
+        **{k: v for k, v in os.environ.items() if k != "NO_COLOR"},
+        "COLUMNS": "80",
+        **environment,
+    }
     subprocess.run(program, cwd=ROOT, stdout=theirs, env=variables, check=True)
     os.close(theirs)
     assert (b"\x1b[" in os.read(ours, 100_000)) == colours
@@ -124,7 +153,11 @@ def test_a_terminal_has_colours_where_it_can_and_may(environment, colours):
 def test_in_ascii_there_is_not_a_box_nor_an_escape():
     program = [sys.executable, "-m", "dgae_jax.cli.main", "train", "--help"]
     done = subprocess.run(
-        program, cwd=ROOT, capture_output=True, env={**os.environ, "PYTHONIOENCODING": "ascii", "COLUMNS": "80"}, check=True
+        program,
+        cwd=ROOT,
+        capture_output=True,
+        env={**os.environ, "PYTHONIOENCODING": "ascii", "COLUMNS": "80"},
+        check=True,
     )
     out = done.stdout.decode("ascii")
     assert "\\x" not in out

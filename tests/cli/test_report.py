@@ -31,7 +31,11 @@ def test_a_report_is_written_beside_the_results_and_a_line_names_each_file(run, 
     path = study(tmp_path / "one", whole(("hopper",), ("ppo", "dppo"), 2))
     code, out, err = run(path, "--published")
     names = [f"{name}.{kind}" for name in NAMES for kind in ("png", "svg")] + ["report.html"]
-    assert (code, out.splitlines(), err) == (0, [f"written {path / 'report' / name}" for name in names], "")
+    assert (code, out.splitlines(), err) == (
+        0,
+        [f"written {path / 'report' / name}" for name in names],
+        "",
+    )
     assert sorted(p.name for p in (path / "report").iterdir()) == sorted(names)
     assert (path / "report" / "learning.png").read_bytes().startswith(b"\x89PNG")
     assert (path / "report" / "report.html").read_text().startswith("<!DOCTYPE html>")
@@ -43,7 +47,11 @@ def test_two_studies_are_compared_in_one_report(run, tmp_path):
     code, _, _ = run(one, two / "results.jsonl", "--out", tmp_path / "a" / "b")
     assert code == 0
     assert {p.name for p in (tmp_path / "a" / "b").iterdir()} == {"report.html"} | {
-        f"{number}-{name}.{kind}" for number in (1, 2) for name in NAMES if name != "improvement" for kind in ("png", "svg")
+        f"{number}-{name}.{kind}"
+        for number in (1, 2)
+        for name in NAMES
+        if name != "improvement"
+        for kind in ("png", "svg")
     }
     assert "+3 [+2, +4]" in (tmp_path / "a" / "b" / "report.html").read_text()
 
@@ -65,7 +73,10 @@ def test_the_run_to_film_is_the_middle_seed_of_the_best_algorithm(tmp_path):
 def test_films_of_runs_that_are_elsewhere_are_refused_before_anything_is_written(run, tmp_path):
     path = study(tmp_path / "one", plain([1, 3]))
     code, _, err = run(path, "--videos")
-    assert (code, err) == (2, f"error: --videos True: must be left out: the runs of {path} are not here\n")
+    assert (code, err) == (
+        2,
+        f"error: --videos True: must be left out: the runs of {path} are not here\n",
+    )
     assert not (path / "report").exists()
 
 
@@ -101,5 +112,7 @@ def test_bad_input_is_one_line_and_nothing_is_written(argv, sentence, run, good,
 
 def test_flags_are_checked_before_matplotlib_and_jax_are_loaded():
     program = "import sys; import dgae_jax.cli.report; print(sorted({'jax', 'matplotlib'} & set(sys.modules)))"
-    done = subprocess.run([sys.executable, "-c", program], cwd=ROOT, capture_output=True, text=True, check=True)
+    done = subprocess.run(
+        [sys.executable, "-c", program], cwd=ROOT, capture_output=True, text=True, check=True
+    )
     assert done.stdout == "[]\n"

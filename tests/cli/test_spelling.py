@@ -24,8 +24,16 @@ def test_what_can_mean_one_thing_is_understood(words, meant):
 
 
 def test_a_command_line_as_other_trainers_write_it_is_the_configuration_it_means():
-    config, _ = parsed(["--env", "Ant-v5", "--algo", "DTRPO", "--total-steps", "3e6", "--physics=native"])
-    assert (config.env, config.env_version, config.algo, config.total_steps, config.physics) == ("ant", "v5", "dtrpo", 3_000_000, "native")
+    config, _ = parsed(
+        ["--env", "Ant-v5", "--algo", "DTRPO", "--total-steps", "3e6", "--physics=native"]
+    )
+    assert (config.env, config.env_version, config.algo, config.total_steps, config.physics) == (
+        "ant",
+        "v5",
+        "dtrpo",
+        3_000_000,
+        "native",
+    )
 
 
 @pytest.mark.parametrize(
@@ -34,10 +42,10 @@ def test_a_command_line_as_other_trainers_write_it_is_the_configuration_it_means
         ("--policy.lr", "--policy.learning-rate"),
         ("--learning-rate", "--policy.learning-rate or --critic.learning-rate"),
         ("--lr=3e-4", "--policy.learning-rate or --critic.learning-rate"),
-        ("--clip", "--policy.clip"),
-        ("--clip_range", "--policy.clip"),
-        ("--gae-lambda", "--lam"),
-        ("--n_steps", "--horizon"),
+        ("--clip", "--policy.clip_eps-eps"),
+        ("--clip_range", "--policy.clip_eps-eps"),
+        ("--gae-lambda", "--gae-lambda"),
+        ("--n_steps", "--num-steps"),
         ("--total-timesteps", "--total-steps"),
         ("--critic.n-quantiles", "--critic.quantiles"),
     ],

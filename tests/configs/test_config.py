@@ -6,20 +6,21 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from dgae_jax import Config, ConfigError, CriticConfig, PolicyConfig
-from dgae_jax.configs.config import resolve
+from dgae_jax.configs.resolved import resolve
 from dgae_jax.configs.serial import from_dict, to_dict
-from dgae_jax.configs.validation import validate
 
 
 def changed(path, value):
     part, _, leaf = path.rpartition(".")
     if not part:
         return dataclasses.replace(Config(), **{path: value})
-    return dataclasses.replace(Config(), **{part: dataclasses.replace(getattr(Config(), part), **{leaf: value})})
+    return dataclasses.replace(
+        Config(), **{part: dataclasses.replace(getattr(Config(), part), **{leaf: value})}
+    )
 
 
 def test_the_default_configuration_is_valid():
-    validate(Config())
+    resolve(Config())
 
 
 @pytest.mark.parametrize(
@@ -31,10 +32,10 @@ def test_the_default_configuration_is_valid():
         ("physics", "bullet", "one of jax, mjx, mjx-warp, native"),
         ("seed", -1, "from 0 to"),
         ("num_seeds", 0, "from 1 to 4,096"),
-        ("total_steps", 2047, "at least one iteration of num_envs \\* horizon = 2,048"),
+        ("total_steps", 2047, "at least one iteration of num_envs \\* num_steps = 2,048"),
         ("total_steps", 2**31, "to 2,147,483,647"),
         ("num_envs", -3, "a whole number from 1 to"),
-        ("horizon", 0, "a whole number from 1 to"),
+        ("num_steps", 0, "a whole number from 1 to"),
         ("episode_length", 0, "a whole number from 1 to"),
         ("gamma", 1.01, "from 0 to 1"),
         ("gamma", float("nan"), "from 0 to 1"),
@@ -43,13 +44,13 @@ def test_the_default_configuration_is_valid():
         ("policy.hidden", (64, 0), "widths of at least 1"),
         ("policy.covariance", "full", "one of shared, state"),
         ("policy.initial_std", 0.0, "above 0"),
-        ("policy.clip", -0.2, "above 0"),
+        ("policy.clip_eps", -0.2, "above 0"),
         ("policy.learning_rate", float("inf"), "above 0"),
         ("policy.learning_rate_end", 2.0, "from 0 to 1"),
         ("policy.epochs", 0, "a whole number from 1 to"),
-        ("policy.minibatches", 7, "a divisor of num_envs \\* horizon = 2,048"),
+        ("policy.minibatches", 7, "a divisor of num_envs \\* num_steps = 2,048"),
         ("policy.max_grad_norm", 0.0, "above 0"),
-        ("critic.minibatches", 3, "a divisor of num_envs \\* horizon = 2,048"),
+        ("critic.minibatches", 3, "a divisor of num_envs \\* num_steps = 2,048"),
         ("critic.target", "td", "one of bellman"),
         ("critic.quantiles", 0, "a whole number from 1 to"),
         ("critic.kappa", 0.0, "above 0"),
@@ -57,12 +58,14 @@ def test_the_default_configuration_is_valid():
 )
 def test_a_bad_value_is_refused_by_flag_value_and_what_is_allowed(path, value, allowed):
     with pytest.raises(ConfigError, match=f"^{path} .*: must be .*{allowed}"):
-        validate(changed(path, value))
+        resolve(changed(path, value))
 
 
 def test_a_setting_the_algorithm_does_not_use_is_refused():
-    with pytest.raises(ConfigError, match=r"critic.quantiles 32: must be left out: ppo with scalar does not use it"):
-        validate(dataclasses.replace(changed("critic.quantiles", 32), algo="ppo"))
+    with pytest.raises(
+        ConfigError, match=r"critic.quantiles 32: must be left out: ppo with scalar does not use it"
+    ):
+        resolve(dataclasses.replace(changed("critic.quantiles", 32), algo="ppo"))
 
 
 def test_resolving_writes_out_the_algorithms_own_target_and_keeps_a_chosen_one():
@@ -77,7 +80,11 @@ def test_resolving_writes_out_the_algorithms_own_target_and_keeps_a_chosen_one()
         num_envs=st.integers(1, 100),
         total_steps=st.integers(1, 10**9),
         gamma=st.floats(0, 1),
-        policy=st.builds(PolicyConfig, hidden=st.lists(st.integers(1, 99), min_size=1).map(tuple), clip=st.floats(0.01, 1)),
+        policy=st.builds(
+            PolicyConfig,
+            hidden=st.lists(st.integers(1, 99), min_size=1).map(tuple),
+            clip=st.floats(0.01, 1),
+        ),
         critic=st.builds(CriticConfig, quantiles=st.integers(1, 99)),
     )
 )
@@ -91,7 +98,10 @@ def test_a_configuration_survives_json(config):
     ("change", "message"),
     [
         (lambda d: d.pop("gamma"), "gamma: missing"),
-        (lambda d: d.pop("schema"), "schema: missing; before schema 2 the engine now called jax had the name mjx"),
+        (
+            lambda d: d.pop("schema"),
+            "schema: missing; before schema 2 the engine now called jax had the name mjx",
+        ),
         (lambda d: d.update(schema=3), "schema 3: must be 2"),
         (lambda d: d.update(extra=1), "extra: unknown"),
         (lambda d: d.update(num_envs="16"), "num_envs: must be int"),
@@ -109,7 +119,10 @@ def test_json_that_is_no_configuration_is_refused_by_name(change, message):
 
 
 def test_leaves_of_the_configuration_are_its_floats_and_its_budget():
-    leaves = {jax.tree_util.keystr(path, simple=True, separator="."): leaf for path, leaf in jax.tree.leaves_with_path(Config())}
+    leaves = {
+        jax.tree_util.keystr(path, simple=True, separator="."): leaf
+        for path, leaf in jax.tree.leaves_with_path(Config())
+    }
     assert {name for name, leaf in leaves.items() if not isinstance(leaf, float)} == {"total_steps"}
     floats = [
         f"{part}.{f.name}"

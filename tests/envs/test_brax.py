@@ -23,9 +23,13 @@ LENGTH = 12
 def test_braxs_wrappers_tell_a_fall_from_a_time_limit_and_hide_where_an_episode_ended():
     task = brax.envs.get_environment("dgae_hopper", physics="native")
     env = EvalWrapper(wrap(task, episode_length=LENGTH))
-    first = state = jax.jit(env.reset)(jax.random.split(jax.random.PRNGKey(0), 2))  # Brax takes their shape for that of the worlds
+    first = state = jax.jit(env.reset)(
+        jax.random.split(jax.random.PRNGKey(0), 2)
+    )  # Brax takes their shape for that of the worlds
     assert state.obs.shape == (2, env.observation_size) == (2, 11)
-    tilted = jnp.array(first.pipeline_state.qpos).at[1, 2].set(0.19).at[0, 2].set(0)  # the second world is about to fall over
+    tilted = (
+        jnp.array(first.pipeline_state.qpos).at[1, 2].set(0.19).at[0, 2].set(0)
+    )  # the second world is about to fall over
     turning = jnp.array(first.pipeline_state.qvel).at[1, 2].set(2.0)
     moved = jax.vmap(lambda qpos, qvel: task.set_state(first, qpos, qvel))(tilted, turning)
     state = state.replace(pipeline_state=moved.pipeline_state)
@@ -39,7 +43,9 @@ def test_braxs_wrappers_tell_a_fall_from_a_time_limit_and_hide_where_an_episode_
         limits += np.array(state.info["truncation"])
         assert_array_equal(state.obs, np.where(ended[:, None], first.obs, true.obs))
         assert_allclose(state.reward, true.reward)
-        assert_array_equal(ended, (np.array(true.done) > 0) | (np.array(state.info["truncation"]) > 0))
+        assert_array_equal(
+            ended, (np.array(true.done) > 0) | (np.array(state.info["truncation"]) > 0)
+        )
     assert_array_equal(falls, [0, 1])
     assert_array_equal(limits, [1, 0])
     assert_array_equal(state.info["eval_metrics"].episode_steps, [LENGTH, 1])
@@ -52,15 +58,23 @@ def test_braxs_wrappers_take_the_shape_of_raw_keys_for_that_of_the_worlds():
 
 
 def test_braxs_ppo_leaves_out_the_step_of_a_time_limit():
-    truncation, reward, value = jnp.array([[0.0], [1.0]]), jnp.array([[1.0], [5.0]]), jnp.array([[2.0], [3.0]])
-    target, advantage = compute_gae(truncation, jnp.zeros((2, 1)), reward, value, jnp.array([9.0]), lambda_=0.5, discount=0.9)
+    truncation, reward, value = (
+        jnp.array([[0.0], [1.0]]),
+        jnp.array([[1.0], [5.0]]),
+        jnp.array([[2.0], [3.0]]),
+    )
+    target, advantage = compute_gae(
+        truncation, jnp.zeros((2, 1)), reward, value, jnp.array([9.0]), lambda_=0.5, discount=0.9
+    )
     assert_allclose(target, [[1 + 0.9 * 3], [3]], rtol=1e-6)
     assert_allclose(advantage, [[1 + 0.9 * 3 - 2], [0]], rtol=1e-6)
 
 
 def test_braxs_trainers_find_what_jax_took_away_only_inside():
     with trainers():
-        assert jax.device_put_replicated({"a": jnp.arange(3)}, jax.devices()[:1])["a"].tolist() == [[0, 1, 2]]
+        assert jax.device_put_replicated({"a": jnp.arange(3)}, jax.devices()[:1])["a"].tolist() == [
+            [0, 1, 2]
+        ]
     assert not hasattr(jax, "device_put_replicated")
 
 
@@ -73,7 +87,14 @@ with trainers():
 print([(shard.device.id, shard.data.tolist()) for shard in copies.addressable_shards])
 """
     two = {**os.environ, "JAX_PLATFORMS": "cpu", "JAX_NUM_CPU_DEVICES": "2"}
-    done = subprocess.run([sys.executable, "-c", program], cwd=ROOT, env=two, capture_output=True, text=True, check=True)
+    done = subprocess.run(
+        [sys.executable, "-c", program],
+        cwd=ROOT,
+        env=two,
+        capture_output=True,
+        text=True,
+        check=True,
+    )
     assert done.stdout == "[(0, [[0, 1, 2]]), (1, [[0, 1, 2]])]\n"
 
 

@@ -64,9 +64,18 @@ def test_actions_lie_between_minus_one_and_one_unless_the_environment_says_other
     ("env", "reason"),
     [
         (3, "int is not a brax.envs.base.Env"),
-        (TwoAxes(), r"the observation of its reset has shape float32\[2\], and must be one array \[observation_size\]"),
-        (Named(), r"the observation of its reset has shape state: float32\[2\], and must be one array \[observation_size\]"),
-        (Growing(), r"its step turns state.info\['extra'\] from nothing into float32\[3\], and must leave it as it is"),
+        (
+            TwoAxes(),
+            r"the observation of its reset has shape float32\[2\], and must be one array \[observation_size\]",
+        ),
+        (
+            Named(),
+            r"the observation of its reset has shape state: float32\[2\], and must be one array \[observation_size\]",
+        ),
+        (
+            Growing(),
+            r"its step turns state.info\['extra'\] from nothing into float32\[3\], and must leave it as it is",
+        ),
         (Wholes(), "the reward of its step is .*int32.*, and must be a single real number"),
         (Broken(), r"its step cannot be compiled by JAX \(KeyError: 'wind\\nand rain'\)"),
     ],

@@ -46,7 +46,9 @@ def taken(env, qpos, qvel, action):
 
     @jax.jit
     def step(key, qpos, qvel, action):
-        return jax.vmap(lambda q, v, a: env.step(env.set_state(env.reset(key), q, v), a))(qpos, qvel, action)
+        return jax.vmap(lambda q, v, a: env.step(env.set_state(env.reset(key), q, v), a))(
+            qpos, qvel, action
+        )
 
     return step(jax.random.key(0), *map(jnp.asarray, (qpos, qvel, action)))
 
@@ -59,7 +61,13 @@ def assert_steps_agree(ours, gym, poses, observation=1e-3, reward=1e-3):
         assert_allclose(ours.obs[i], obs, atol=observation)
         assert_allclose(ours.reward[i], theirs, atol=reward)
         assert bool(ours.done[i]) == terminated
-        for name in {"x_velocity", "y_velocity", "reward_forward", "reward_survive", "reward_contact"} & set(info):
+        for name in {
+            "x_velocity",
+            "y_velocity",
+            "reward_forward",
+            "reward_survive",
+            "reward_contact",
+        } & set(info):
             assert_allclose(ours.metrics[name][i], info[name], atol=reward, err_msg=name)
     gym.close()
 
@@ -70,8 +78,16 @@ CASES = [
     *(("jax", name, "v4") for name in sorted(GYM_TASKS)),
     ("jax", "ant", "v5"),
     *(pytest.param("jax", name, "v5", marks=slow) for name in sorted(GYM_TASKS) if name != "ant"),
-    *(pytest.param("mjx", *case, marks=(slow, UPSTREAM) if case[0] == "ant" else slow) for case in PLAIN),
-    *(pytest.param("mjx-warp", *case, marks=(slow, WARP, UPSTREAM) if case[0] == "ant" else (slow, WARP)) for case in PLAIN),
+    *(
+        pytest.param("mjx", *case, marks=(slow, UPSTREAM) if case[0] == "ant" else slow)
+        for case in PLAIN
+    ),
+    *(
+        pytest.param(
+            "mjx-warp", *case, marks=(slow, WARP, UPSTREAM) if case[0] == "ant" else (slow, WARP)
+        )
+        for case in PLAIN
+    ),
 ]
 
 
@@ -106,21 +122,55 @@ def test_most_of_ants_steps_in_mjx_agree_with_gymnasium(physics, version):
 
 
 @pytest.mark.parametrize(
-    ("name", "low", "high"), [("hopper", 0.1, 0.9), ("walker2d", 0.1, 0.9), ("ant", 0.001, 0.5), ("swimmer", -1, 0.001)]
+    ("name", "low", "high"),
+    [("hopper", 0.1, 0.9), ("walker2d", 0.1, 0.9), ("ant", 0.001, 0.5), ("swimmer", -1, 0.001)],
 )
 def test_the_comparison_sees_both_healthy_and_terminated_steps(name, low, high):
-    assert low < float(taken(dg.make_env(name, physics="native"), *visited(name)).done.mean()) < high
+    assert (
+        low < float(taken(dg.make_env(name, physics="native"), *visited(name)).done.mean()) < high
+    )
 
 
 PARAMETERS = [
     ("hopper", {"forward_reward_weight": 2.0, "ctrl_cost_weight": 0.5, "healthy_reward": 3.0}),
     ("hopper", {"terminate_when_unhealthy": False}),
-    ("hopper", {"healthy_z_range": (1.2, 1.3), "healthy_angle_range": (-0.05, 0.05), "healthy_state_range": (-5.0, 5.0)}),
+    (
+        "hopper",
+        {
+            "healthy_z_range": (1.2, 1.3),
+            "healthy_angle_range": (-0.05, 0.05),
+            "healthy_state_range": (-5.0, 5.0),
+        },
+    ),
     ("hopper", {"exclude_current_positions_from_observation": False}),
-    ("walker2d", {"healthy_z_range": (1.0, 1.3), "healthy_angle_range": (-0.1, 0.5), "ctrl_cost_weight": 0.1}),
-    ("swimmer", {"exclude_current_positions_from_observation": False, "forward_reward_weight": 3.0, "ctrl_cost_weight": 0.1}),
-    ("ant", {"healthy_z_range": (0.4, 0.6), "ctrl_cost_weight": 0.1, "exclude_current_positions_from_observation": False}),
-    ("ant", {"contact_cost_weight": 0.1, "contact_force_range": (-0.5, 0.2), "healthy_reward": 2.0}),
+    (
+        "walker2d",
+        {
+            "healthy_z_range": (1.0, 1.3),
+            "healthy_angle_range": (-0.1, 0.5),
+            "ctrl_cost_weight": 0.1,
+        },
+    ),
+    (
+        "swimmer",
+        {
+            "exclude_current_positions_from_observation": False,
+            "forward_reward_weight": 3.0,
+            "ctrl_cost_weight": 0.1,
+        },
+    ),
+    (
+        "ant",
+        {
+            "healthy_z_range": (0.4, 0.6),
+            "ctrl_cost_weight": 0.1,
+            "exclude_current_positions_from_observation": False,
+        },
+    ),
+    (
+        "ant",
+        {"contact_cost_weight": 0.1, "contact_force_range": (-0.5, 0.2), "healthy_reward": 2.0},
+    ),
 ]
 
 
@@ -128,14 +178,18 @@ PARAMETERS = [
 @pytest.mark.parametrize(("name", "parameters"), PARAMETERS)
 def test_task_parameters_mean_what_they_mean_in_gymnasium(name, parameters, version):
     poses = tuple(x[::8] for x in visited(name))
-    env, gym = dg.make_env(name, physics="native", version=version, **parameters), gymnasium_task(name, version, **parameters)
+    env, gym = (
+        dg.make_env(name, physics="native", version=version, **parameters),
+        gymnasium_task(name, version, **parameters),
+    )
     ours = taken(env, *poses)
     assert ours.obs.shape[1:] == gym.observation_space.shape == (env.observation_size,)
     assert_steps_agree(ours, gym, poses, reward=3e-3)
 
 
 @pytest.mark.parametrize(
-    ("version", "parameters"), [("v4", {"use_contact_forces": True}), ("v5", {"include_cfrc_ext_in_observation": False})]
+    ("version", "parameters"),
+    [("v4", {"use_contact_forces": True}), ("v5", {"include_cfrc_ext_in_observation": False})],
 )
 def test_ant_observes_contact_forces_where_the_version_and_its_flag_say_so(version, parameters):
     poses = tuple(x[::8] for x in visited("ant"))
@@ -147,7 +201,11 @@ def test_ant_observes_contact_forces_where_the_version_and_its_flag_say_so(versi
 @pytest.mark.parametrize(("name", "version"), PLAIN)
 def test_constants_are_gymnasiums(name, version):
     gym, env = gymnasium_task(name, version), dg.make_env(name, physics="native", version=version)
-    theirs = {k: p.default for k, p in inspect.signature(type(gym).__init__).parameters.items() if p.default is not p.empty}
+    theirs = {
+        k: p.default
+        for k, p in inspect.signature(type(gym).__init__).parameters.items()
+        if p.default is not p.empty
+    }
     ours = {}
     for cls in reversed(type(env).__mro__):
         if issubclass(cls, Env) and "__init__" in vars(cls):
@@ -172,11 +230,16 @@ def test_the_control_cost_takes_the_action_as_given():
     assert_allclose(outside.metrics["reward_ctrl"], -1e-3 * 12)
 
 
-@pytest.mark.parametrize(("name", "scale"), [("hopper", 5e-3), ("walker2d", 5e-3), ("swimmer", 0.1), ("ant", 0.1)])
+@pytest.mark.parametrize(
+    ("name", "scale"), [("hopper", 5e-3), ("walker2d", 5e-3), ("swimmer", 0.1), ("ant", 0.1)]
+)
 def test_resets_scatter_around_the_initial_pose_as_gymnasiums_do(name, scale):
     env = dg.make_env(name, physics="native")
     states = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.key(0), 4_000)).pipeline_state
-    position, velocity = np.asarray(states.qpos) - np.asarray(env._init_qpos), np.asarray(states.qvel)
+    position, velocity = (
+        np.asarray(states.qpos) - np.asarray(env._init_qpos),
+        np.asarray(states.qvel),
+    )
     assert np.abs(position).max() <= scale * (1 + 1e-3)
     assert_allclose(position.std(0), scale / 3**0.5, rtol=0.06)
     assert_allclose(velocity.std(0), scale if name == "ant" else scale / 3**0.5, rtol=0.06)
@@ -191,9 +254,13 @@ def test_resets_accept_the_legacy_keys_of_braxs_own_trainers():
 
 def test_hoppers_observation_clips_velocities_at_ten_and_swimmers_does_not():
     hopper, swimmer = (dg.make_env(name, physics="native") for name in ("hopper", "swimmer"))
-    state = hopper.set_state(hopper.reset(jax.random.key(0)), jnp.zeros(6), jnp.array([-20.0, 20, 3, 0, 0, 0]))
+    state = hopper.set_state(
+        hopper.reset(jax.random.key(0)), jnp.zeros(6), jnp.array([-20.0, 20, 3, 0, 0, 0])
+    )
     assert_allclose(state.obs[5:8], [-10, 10, 3])
-    state = swimmer.set_state(swimmer.reset(jax.random.key(0)), jnp.zeros(5), jnp.array([-20.0, 20, 3, 0, 0]))
+    state = swimmer.set_state(
+        swimmer.reset(jax.random.key(0)), jnp.zeros(5), jnp.array([-20.0, 20, 3, 0, 0])
+    )
     assert_allclose(state.obs[3:6], [-20, 20, 3])
 
 
@@ -210,7 +277,9 @@ def test_braxs_own_trainer_trains_on_a_task(monkeypatch):
 
     import dgae_jax.envs.brax  # noqa: F401
 
-    def replicated(tree, devices):  # Brax 0.14 calls this function of JAX's, which JAX 0.10 no longer has
+    def replicated(
+        tree, devices
+    ):  # Brax 0.14 calls this function of JAX's, which JAX 0.10 no longer has
         return jax.tree.map(lambda x: jnp.stack([x] * len(devices)), tree)
 
     monkeypatch.setattr(jax, "device_put_replicated", replicated, raising=False)

@@ -22,7 +22,9 @@ def roll_out(env, key, steps, limit=1000):
     """Random actions in eighths, which no program rounds, some of them beyond the range; where the worlds began too."""
 
     def act(keys, obs):
-        return jax.vmap(lambda key: jax.random.randint(key, (env.action_size,), -32, 33) / 8)(keys), jnp.zeros(len(obs))
+        return jax.vmap(lambda key: jax.random.randint(key, (env.action_size,), -32, 33) / 8)(
+            keys
+        ), jnp.zeros(len(obs))
 
     first = start(env, jax.random.split(key, WORLDS))
     keys = jax.random.split(key, (steps, WORLDS))
@@ -30,22 +32,34 @@ def roll_out(env, key, steps, limit=1000):
 
 
 @pytest.mark.parametrize(
-    ("name", "steps", "limit"), [("Pendulum-v1", 220, 1000), ("Pendulum-v1", 20, 15), ("InvertedPendulum-v5", 40, 1000)]
+    ("name", "steps", "limit"),
+    [("Pendulum-v1", 220, 1000), ("Pendulum-v1", 20, 15), ("InvertedPendulum-v5", 40, 1000)],
 )
-def test_a_rollout_is_what_gymnasium_says_step_by_step_until_the_episode_ends_there(name, steps, limit, key):
+def test_a_rollout_is_what_gymnasium_says_step_by_step_until_the_episode_ends_there(
+    name, steps, limit, key
+):
     env = dg.make_env(f"gymnasium:{name}")
     (_, step), first = jax.jit(roll_out, static_argnums=(0, 2, 3))(env, key, steps, limit)
     high, low = np.asarray(first.env.pipeline_state.seed, np.uint64).T
     for i in range(WORLDS):
-        world = gymnasium.make(name, max_episode_steps=min(limit, gymnasium.spec(name).max_episode_steps))
+        world = gymnasium.make(
+            name, max_episode_steps=min(limit, gymnasium.spec(name).max_episode_steps)
+        )
         obs, _ = world.reset(seed=int(high[i]) << 32 | int(low[i]))
         over, t = False, 0
         while not over:
             assert_array_equal(step.obs[t, i], np.float32(obs))
             space = world.action_space
-            obs, reward, terminated, truncated, _ = world.step(np.clip(np.asarray(step.action[t, i]), space.low, space.high))
-            assert_array_equal([*step.next_obs[t, i], step.reward[t, i]], np.float32([*obs, reward]))  # the true successor
-            assert (step.terminated[t, i], step.truncated[t, i]) == (terminated, truncated and not terminated)
+            obs, reward, terminated, truncated, _ = world.step(
+                np.clip(np.asarray(step.action[t, i]), space.low, space.high)
+            )
+            assert_array_equal(
+                [*step.next_obs[t, i], step.reward[t, i]], np.float32([*obs, reward])
+            )  # the true successor
+            assert (step.terminated[t, i], step.truncated[t, i]) == (
+                terminated,
+                truncated and not terminated,
+            )
             over, t = terminated or truncated, t + 1
         assert t < steps
         assert not np.allclose(step.obs[t, i], obs)  # another episode
@@ -56,7 +70,9 @@ def test_the_same_key_gives_the_same_numbers_alone_again_and_side_by_side(key):
     env = dg.make_env("gymnasium:Pendulum-v1")
     run = jax.jit(lambda key: roll_out(env, key, 210)[0])
     once, again = run(key), run(key)
-    both = jax.jit(jax.vmap(lambda key: roll_out(env, key, 210)[0]))(jnp.stack([key, jax.random.key(1)]))
+    both = jax.jit(jax.vmap(lambda key: roll_out(env, key, 210)[0]))(
+        jnp.stack([key, jax.random.key(1)])
+    )
     jax.tree.map(lambda a, b, c: [assert_array_equal(x, a) for x in (b, c[0])], once, again, both)
     assert jnp.abs(both[1].obs[0] - both[1].obs[1]).max() > 0.1
 
@@ -64,7 +80,9 @@ def test_the_same_key_gives_the_same_numbers_alone_again_and_side_by_side(key):
 @pytest.mark.parametrize("wrap", [lambda env: env, lambda env: Noisy(env, observation=0.1)])
 def test_a_world_begins_anew_only_where_its_episode_has_ended(wrap, key, monkeypatch):
     begun, begin = [], tasks._Worlds._begin
-    monkeypatch.setattr(tasks._Worlds, "_begin", lambda self, i, seed: (begun.append(i), begin(self, i, seed))[1])
+    monkeypatch.setattr(
+        tasks._Worlds, "_begin", lambda self, i, seed: (begun.append(i), begin(self, i, seed))[1]
+    )
     env = wrap(dg.make_env("gymnasium:InvertedPendulum-v5"))
     (_, step), _ = jax.block_until_ready(jax.jit(lambda key: roll_out(env, key, 40))(key))
     ended = (step.terminated | step.truncated).sum(0)
@@ -80,7 +98,9 @@ def test_a_world_only_goes_forward(key):
     step(after, jnp.ones(1))
     with pytest.raises(jax.errors.JaxRuntimeError, match="only goes forward"):
         jax.block_until_ready(step(after, jnp.ones(1)))
-    assert_array_equal(step(state, jnp.ones(1)).obs, after.obs)  # the beginning of an episode can be gone back to
+    assert_array_equal(
+        step(state, jnp.ones(1)).obs, after.obs
+    )  # the beginning of an episode can be gone back to
 
 
 def test_the_worlds_of_an_environment_are_closed_with_it(key):
@@ -95,7 +115,10 @@ def test_the_worlds_of_an_environment_are_closed_with_it(key):
 @pytest.mark.parametrize(
     ("name", "reason"),
     [
-        ("CartPole-v1", r"its actions are Discrete\(2\), and must be a Box with one axis of real numbers"),
+        (
+            "CartPole-v1",
+            r"its actions are Discrete\(2\), and must be a Box with one axis of real numbers",
+        ),
         ("FrozenLake-v1", r"its actions are Discrete\(4\)"),
         ("Nope-v1", "Gymnasium cannot make it: NameNotFound: Environment `Nope` doesn't exist"),
         ("nowhere:Nope-v1", "Gymnasium cannot make it: ModuleNotFoundError"),
@@ -106,10 +129,14 @@ def test_a_task_with_other_actions_or_none_of_gymnasiums_is_refused_with_the_rea
         dg.make_env(f"gymnasium:{name}")
 
 
-@pytest.mark.parametrize("space", [gymnasium.spaces.Box(0, 255, (8, 8, 3), np.uint8), gymnasium.spaces.Dict()])
+@pytest.mark.parametrize(
+    "space", [gymnasium.spaces.Box(0, 255, (8, 8, 3), np.uint8), gymnasium.spaces.Dict()]
+)
 def test_observations_that_are_no_row_of_numbers_are_refused(space, monkeypatch):
     made = gymnasium.make("Pendulum-v1")
     made.observation_space = space
     monkeypatch.setattr(gymnasium, "make", lambda *_, **__: made)
-    with pytest.raises(ValueError, match=r"its observations are .*, and must be a Box with one axis"):
+    with pytest.raises(
+        ValueError, match=r"its observations are .*, and must be a Box with one axis"
+    ):
         dg.make_env("gymnasium:Pendulum-v1")

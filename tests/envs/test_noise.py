@@ -5,22 +5,31 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 import dgae_jax as dg
-from dgae_jax.configs.build import make_task
 from dgae_jax.envs.noise import Noisy
+from dgae_jax.learn.build import make_task
 from dgae_jax.learn.rollout import rollout, start
 from tests.probes import Constant, Counter
 
 
-def collect(env, key, horizon=400):
+def collect(env, key, num_steps=400):
     def act(key, obs):
         return jnp.zeros((obs.shape[0], 1)), jnp.zeros(obs.shape[0])
 
-    return rollout(env, act, start(env, jax.random.split(key, 16)), jax.random.split(key, (horizon, 16)), episode_length=50)[1]
+    return rollout(
+        env,
+        act,
+        start(env, jax.random.split(key, 16)),
+        jax.random.split(key, (num_steps, 16)),
+        episode_length=50,
+    )[1]
 
 
 def test_without_noise_the_task_is_left_as_it_is():
     assert not isinstance(make_task(dg.Config(env="hopper", physics="native")), Noisy)
-    assert isinstance(make_task(dg.Config(env="hopper", physics="native", noise=dg.NoiseConfig(reward=1.0))), Noisy)
+    assert isinstance(
+        make_task(dg.Config(env="hopper", physics="native", noise=dg.NoiseConfig(reward=1.0))),
+        Noisy,
+    )
 
 
 def test_reward_noise_has_its_deviation_and_is_drawn_afresh(key):
@@ -40,7 +49,9 @@ def test_action_noise_reaches_the_task_and_not_the_record(key):
     env = Noisy(Counter(), action=0.2)
     state = jax.vmap(env.reset)(jax.random.split(key, 500))
     after = jax.vmap(env.step)(state, jnp.ones((500, 1)))
-    assert_allclose([after.metrics["action"].mean(), after.metrics["action"].std()], [1, 0.2], atol=0.03)
+    assert_allclose(
+        [after.metrics["action"].mean(), after.metrics["action"].std()], [1, 0.2], atol=0.03
+    )
 
 
 def test_initial_noise_moves_the_start_of_our_tasks_and_is_refused_elsewhere(key):

@@ -13,7 +13,9 @@ from dgae_jax.learn.rollout import rollout, start
 
 pytestmark = [
     pytest.mark.slow,
-    pytest.mark.skipif(find_spec("mujoco_playground") is None, reason="playground is not installed"),
+    pytest.mark.skipif(
+        find_spec("mujoco_playground") is None, reason="playground is not installed"
+    ),
     pytest.mark.filterwarnings("default"),  # its own
 ]
 
@@ -28,7 +30,10 @@ def test_a_task_whose_robot_would_be_downloaded_is_refused(monkeypatch, tmp_path
 
     monkeypatch.setattr(mjx_env, "MENAGERIE_PATH", tmp_path / "mujoco_menagerie")
     monkeypatch.setattr(mjx_env, "ensure_menagerie_exists", lambda: pytest.fail("a download"))
-    with pytest.raises(ValueError, match=r"its robot is in mujoco_menagerie, which Playground looks for in .* and would download"):
+    with pytest.raises(
+        ValueError,
+        match=r"its robot is in mujoco_menagerie, which Playground looks for in .* and would download",
+    ):
         dg.make_env("playground:Go1Getup")
 
 
@@ -42,7 +47,10 @@ def test_parameters_override_the_tasks_configuration(key):
 def test_a_task_is_playgrounds_own_with_its_time_limit_as_a_truncation(key):
     from mujoco_playground import registry
 
-    env, theirs = dg.make_env("playground:CartpoleBalance"), registry.load("CartpoleBalance", config_overrides={"impl": "jax"})
+    env, theirs = (
+        dg.make_env("playground:CartpoleBalance"),
+        registry.load("CartpoleBalance", config_overrides={"impl": "jax"}),
+    )
     assert (env.observation_size, env.action_size, env.backend) == (5, 1, "mjx")
     assert_array_equal(env.action_range, [[-1], [1]])
 

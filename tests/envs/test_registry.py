@@ -38,7 +38,10 @@ PREFIXES = "one of ant, hopper, swimmer, walker2d, or brax:NAME, playground:NAME
     ("name", "allowed"),
     [
         *((name, PREFIXES) for name in ("hoper", "brax:", "gymnasium:", "")),
-        *((f"brax:{name}", "brax:NAME with NAME one of ant, fast") for name in ("nope", "swimmer", "dgae_ant")),
+        *(
+            (f"brax:{name}", "brax:NAME with NAME one of ant, fast")
+            for name in ("nope", "swimmer", "dgae_ant")
+        ),
         ("custom:Mine", "given as an object from Python"),
     ],
 )
@@ -68,11 +71,19 @@ def test_an_object_is_a_task_by_the_name_of_its_class_while_the_context_lasts():
 @pytest.mark.parametrize(
     ("name", "options", "allowed"),
     [
-        ("hopper", {"physics": "bullet"}, "physics bullet: must be one of jax, mjx, mjx-warp, native"),
+        (
+            "hopper",
+            {"physics": "bullet"},
+            "physics bullet: must be one of jax, mjx, mjx-warp, native",
+        ),
         ("hopper", {"version": "v9"}, "version v9: must be one of v4, v5"),
         ("brax:ant", {"physics": "native"}, "physics native: must be one of mjx"),
         ("brax:ant", {"version": "v4"}, "version v4: must be left out"),
-        ("brax:ant", {"feet": 4}, "environment brax:ant: must be one that Brax can build on mjx .*feet"),
+        (
+            "brax:ant",
+            {"feet": 4},
+            "environment brax:ant: must be one that Brax can build on mjx .*feet",
+        ),
     ],
 )
 def test_what_a_task_does_not_have_is_refused_with_what_it_has(name, options, allowed):
@@ -83,7 +94,10 @@ def test_what_a_task_does_not_have_is_refused_with_what_it_has(name, options, al
 def test_the_names_of_braxs_own_are_those_that_brax_builds_on_mjx():
     own = {name for name in brax.envs._envs if not name.startswith("dgae_")}
     assert own == {*BRAX_NAMES, "swimmer"}
-    with pytest.warns(UserWarning, match="not actively"), pytest.raises(ValueError, match="Unsupported backend"):
+    with (
+        pytest.warns(UserWarning, match="not actively"),
+        pytest.raises(ValueError, match="Unsupported backend"),
+    ):
         brax.envs.get_environment("swimmer", backend="mjx")
     for name in BRAX_NAMES:
         assert dg.make_env(f"brax:{name}").action_size > 0
@@ -102,7 +116,9 @@ def test_an_environment_of_braxs_own_takes_our_trainers_contract():
     assert jnp.isfinite(jax.jit(env.reset)(jax.random.key(0)).obs).all()
 
 
-def test_building_an_environment_of_braxs_own_prints_nothing_and_writes_no_file(monkeypatch, tmp_path, capfd):
+def test_building_an_environment_of_braxs_own_prints_nothing_and_writes_no_file(
+    monkeypatch, tmp_path, capfd
+):
     monkeypatch.chdir(tmp_path)
     dg.make_env("brax:halfcheetah")
     assert capfd.readouterr() == ("", "")

@@ -56,7 +56,10 @@ def test_the_return_from_a_state_on_is_a_geometric_sum():
 
 def test_an_episode_that_ends_by_a_fall_is_the_one_that_gymnasium_plays():
     number = int(episode_seeds(3, 1)[0])
-    episode, (rewards, qpos) = play(actor(), number, 10.0), alone("Hopper-v4", (0.1, -0.2, 0.3), number, 1000)
+    episode, (rewards, qpos) = (
+        play(actor(), number, 10.0),
+        alone("Hopper-v4", (0.1, -0.2, 0.3), number, 1000),
+    )
     assert episode.fell
     assert 5 < len(rewards) < 1000
     np.testing.assert_array_equal(episode.qpos, qpos)
@@ -81,14 +84,18 @@ def test_quantiles_are_sorted_and_valued_by_the_preference_of_the_run():
         np.testing.assert_allclose(episode.value, value)
 
 
-@pytest.mark.parametrize(("limit", "seconds", "states"), [(5, 10.0, 5), (1000, 0.08, 2), (1000, 1e-6, 1)])
+@pytest.mark.parametrize(
+    ("limit", "seconds", "states"), [(5, 10.0, 5), (1000, 0.08, 2), (1000, 1e-6, 1)]
+)
 def test_an_episode_is_shown_up_to_its_time_limit_or_so_many_seconds(limit, seconds, states):
     assert len(play(actor("swimmer", (0, 0), episode_length=limit), 7, seconds).qpos) == states
 
 
 def test_scenes_are_the_initial_states_of_an_evaluation(monkeypatch):
     played = []
-    monkeypatch.setattr(episodes, "play", lambda actor, number, seconds: played.append((actor, number, seconds)))
+    monkeypatch.setattr(
+        episodes, "play", lambda actor, number, seconds: played.append((actor, number, seconds))
+    )
     list(episodes._played(["a", "b"], episodes.Shots(2, 5, 1.0)))
     first, second = (int(n) for n in episode_seeds(5, 2))
     assert played == [("a", first, 1.0), ("b", first, 1.0), ("a", second, 1.0), ("b", second, 1.0)]

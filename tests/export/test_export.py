@@ -45,7 +45,17 @@ def run(monkeypatch, capsys):
 
 
 def test_each_format_is_a_directory_in_the_run_directory(run_dir):
-    command = [sys.executable, "experiments/export.py", str(run_dir), "--to", "npz", "onnx", "gymnasium", "--index", "1"]
+    command = [
+        sys.executable,
+        "experiments/export.py",
+        str(run_dir),
+        "--to",
+        "npz",
+        "onnx",
+        "gymnasium",
+        "--index",
+        "1",
+    ]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=300)
     assert (done.returncode, done.stderr) == (0, "")
     assert done.stdout == (
@@ -62,15 +72,19 @@ def test_a_policys_file_is_exported_beside_it_and_again_over_it(run_dir, run, tm
     config = read_config(run_dir)
     file = tmp_path / "policies" / "hopper.msgpack"
     file.parent.mkdir()
-    found = restore.trained(run_dir, config, "newest")
+    found = restore.trained(run_dir, config, "latest")
     restore.save_networks(file, config, found, restore.reward_std(found.path, config))
     for _ in range(2):
         code, out, err = run(file, "--to", "npz", "npz")
         where = tmp_path / "policies" / "hopper-export" / "npz"
-        assert (code, out, err) == (0, f"written to {where}: policy.npz, policy.py, README.md\n", "")
+        assert (code, out, err) == (
+            0,
+            f"written to {where}: policy.npz, policy.py, README.md\n",
+            "",
+        )
     assert sorted(path.name for path in where.iterdir()) == ["README.md", "policy.npz", "policy.py"]
     code, _, err = run(file, "--to", "npz", "--checkpoint", "best")
-    assert (code, err) == (2, f"error: --checkpoint best: must be newest: {file} is a single one\n")
+    assert (code, err) == (2, f"error: --checkpoint best: must be latest: {file} is a single one\n")
 
 
 def test_each_seed_and_each_checkpoint_has_its_own_weights(run_dir, run, tmp_path):
@@ -89,19 +103,39 @@ def test_each_seed_and_each_checkpoint_has_its_own_weights(run_dir, run, tmp_pat
 @pytest.mark.parametrize(
     ("argv", "message"),
     [
-        (["nowhere", "--to", "npz"], r"nowhere: must be a run directory; there is nothing of that name"),
+        (
+            ["nowhere", "--to", "npz"],
+            r"nowhere: must be a run directory; there is nothing of that name",
+        ),
         (["RUN", "--to", "tflite"], r"--to tflite: must be one of npz, onnx, gymnasium"),
         (["RUN"], r"--to"),
         (["RUN", "--to"], r"--to"),
         (["RUN", "--to", "npz", "--checkpoint", "last"], r"--checkpoint last: must be one of"),
-        (["RUN", "--to", "npz", "--index", "2"], r"--index 2: must be a whole number from 0 to 1, the index of a seed in RUN"),
-        (["RUN", "--to", "npz", "--index", "-1"], r"--index -1: must be a whole number from 0 to 1, the index of a seed in RUN"),
-        (["RUN", "--to", "npz", "--out", "/dev/null/x"], r"--out /dev/null/x: must be a directory that can be written"),
-        (["RUN", "--to", "npz", "--out", "RUN/config.json"], r"--out RUN/config\.json: must be a directory that can be written"),
-        (["RUN", "--to", "npz", "--out", "x" * 300], r"--out x+: must be a directory that can be written"),
+        (
+            ["RUN", "--to", "npz", "--index", "2"],
+            r"--index 2: must be a whole number from 0 to 1, the index of a seed in RUN",
+        ),
+        (
+            ["RUN", "--to", "npz", "--index", "-1"],
+            r"--index -1: must be a whole number from 0 to 1, the index of a seed in RUN",
+        ),
+        (
+            ["RUN", "--to", "npz", "--out", "/dev/null/x"],
+            r"--out /dev/null/x: must be a directory that can be written",
+        ),
+        (
+            ["RUN", "--to", "npz", "--out", "RUN/config.json"],
+            r"--out RUN/config\.json: must be a directory that can be written",
+        ),
+        (
+            ["RUN", "--to", "npz", "--out", "x" * 300],
+            r"--out x+: must be a directory that can be written",
+        ),
     ],
 )
-def test_bad_input_is_refused_in_one_line_before_anything_is_written(argv, message, run_dir, run, monkeypatch, tmp_path):
+def test_bad_input_is_refused_in_one_line_before_anything_is_written(
+    argv, message, run_dir, run, monkeypatch, tmp_path
+):
     (tmp_path / "here").mkdir()
     monkeypatch.chdir(tmp_path / "here")
     before = {path: path.stat().st_mtime_ns for path in run_dir.rglob("*")}
@@ -116,14 +150,20 @@ def test_a_place_that_turns_out_not_to_be_writable_is_refused_in_one_line(run_di
     (tmp_path / "out" / "npz" / "policy.npz").mkdir(parents=True)
     code, out, err = run(run_dir, "--to", "npz", "--out", tmp_path / "out")
     assert (code, out) == (2, "")
-    assert err == f"error: --out {tmp_path / 'out'}: must be a directory that can be written (Is a directory)\n"
+    assert (
+        err
+        == f"error: --out {tmp_path / 'out'}: must be a directory that can be written (Is a directory)\n"
+    )
 
 
 def test_without_onnx_its_extra_is_named_and_the_other_formats_go_on(run_dir, run, monkeypatch):
     monkeypatch.setitem(sys.modules, "onnx", None)
     code, out, err = run(run_dir, "--to", "npz", "onnx")
     assert (code, out) == (2, "")
-    assert err == 'error: onnx is not installed, which makes the model: pip install "dgae_jax[export]", or leave out --to onnx\n'
+    assert (
+        err
+        == 'error: onnx is not installed, which makes the model: pip install "dgae_jax[export]", or leave out --to onnx\n'
+    )
     assert not (run_dir / "export").exists()
     assert run(run_dir, "--to", "npz", "gymnasium")[0] == 0
 
@@ -133,7 +173,10 @@ def test_a_task_that_gymnasium_does_not_have_gets_no_agent(run_dir, run):
     config |= {"env": "brax:ant", "env_version": None, "physics": "mjx"}
     (run_dir / "config.json").write_text(json.dumps(config))
     code, _, err = run(run_dir, "--to", "gymnasium")
-    assert (code, err) == (2, "error: --to gymnasium: must be left out with brax:ant, which Gymnasium does not play\n")
+    assert (code, err) == (
+        2,
+        "error: --to gymnasium: must be left out with brax:ant, which Gymnasium does not play\n",
+    )
 
 
 def test_a_mistake_is_refused_before_jax_and_mujoco_are_imported(run_dir):
@@ -146,6 +189,8 @@ try:
 except SystemExit as stop:
     print(stop.code, [name for name in ("jax", "mujoco", "brax", "flax", "gymnasium", "onnx") if name in sys.modules])
 """
-    done = subprocess.run([sys.executable, "-c", program, str(run_dir)], cwd=ROOT, capture_output=True, text=True)
+    done = subprocess.run(
+        [sys.executable, "-c", program, str(run_dir)], cwd=ROOT, capture_output=True, text=True
+    )
     assert done.stdout == "2 []\n"
     assert done.stderr.startswith("error: --index 9: must be")

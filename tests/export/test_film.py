@@ -47,18 +47,28 @@ def test_an_mp4_has_the_frames_and_the_speed_that_were_given(fps, tmp_path):
 def test_a_gif_has_half_of_the_frames_and_runs_as_fast_for_ever(tmp_path):
     video.write(frames(9), tmp_path / "film", ("gif",), 25)
     with Image.open(tmp_path / "film.gif") as gif:
-        assert (gif.n_frames, gif.info["duration"], gif.info["loop"], gif.size) == (5, 80, 0, (64, 48))
+        assert (gif.n_frames, gif.info["duration"], gif.info["loop"], gif.size) == (
+            5,
+            80,
+            0,
+            (64, 48),
+        )
 
 
 @pytest.mark.parametrize(("fps", "frames_per_second"), [(10, 10), (18, 9), (30, 10), (100, 12.5)])
 def test_a_gif_never_has_more_frames_per_second_than_it_may(fps, frames_per_second, tmp_path):
     video.write(frames(16), tmp_path / "film", ("gif",), fps)
     with Image.open(tmp_path / "film.gif") as gif:
-        assert gif.info["duration"] == pytest.approx(1000 / frames_per_second, abs=5)  # it counts in hundredths of a second
+        assert gif.info["duration"] == pytest.approx(
+            1000 / frames_per_second, abs=5
+        )  # it counts in hundredths of a second
 
 
 def test_both_files_come_from_one_pass_over_the_frames(tmp_path):
-    names = [path.name for path in video.write(iter(frames(4)), tmp_path / "film", video.FORMATS["both"], 25)]
+    names = [
+        path.name
+        for path in video.write(iter(frames(4)), tmp_path / "film", video.FORMATS["both"], 25)
+    ]
     assert names == ["film.mp4", "film.gif"]
     assert sorted(path.name for path in tmp_path.iterdir()) == ["film.gif", "film.mp4"]
 

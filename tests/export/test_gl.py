@@ -29,7 +29,10 @@ def test_egl_is_taken_before_osmesa_and_said_to_mujoco(there, taken, looked_at, 
 
 
 def test_none_is_refused_with_what_to_install(works):
-    with pytest.raises(ConfigError, match="neither egl nor osmesa draws a picture here; on Debian: apt install libegl1"):
+    with pytest.raises(
+        ConfigError,
+        match="neither egl nor osmesa draws a picture here; on Debian: apt install libegl1",
+    ):
         gl.choose()
     assert gl.VARIABLE not in os.environ
 
@@ -40,7 +43,9 @@ def test_what_the_user_chose_is_taken_or_refused_and_never_replaced(works, monke
     monkeypatch.setenv(gl.VARIABLE, "glfw")
     assert gl.choose() == "glfw"
     monkeypatch.setenv(gl.VARIABLE, "osmesa")
-    with pytest.raises(ConfigError, match=r"^MUJOCO_GL=osmesa: must be egl, osmesa or another that draws"):
+    with pytest.raises(
+        ConfigError, match=r"^MUJOCO_GL=osmesa: must be egl, osmesa or another that draws"
+    ):
         gl.choose()
     assert tried == ["glfw", "osmesa"]
 

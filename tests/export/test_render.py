@@ -63,7 +63,13 @@ def run(monkeypatch, capsys):
 def dgae(*argv):
     """A command in a process of its own, which has OpenGL; what it printed."""
     script, *rest = map(str, argv)
-    done = subprocess.run([sys.executable, f"experiments/{script}.py", *rest], cwd=ROOT, capture_output=True, text=True, timeout=300)
+    done = subprocess.run(
+        [sys.executable, f"experiments/{script}.py", *rest],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        timeout=300,
+    )
     assert (done.returncode, done.stderr) == (0, "")
     return done.stdout
 
@@ -74,14 +80,30 @@ def length(path):
         return sum(frame.info["duration"] for frame in ImageSequence.Iterator(gif))
 
 
-def test_a_film_of_a_run_is_an_mp4_and_a_gif_in_which_the_robot_moves_over_its_strip(distributional, tmp_path, opengl):
-    out = dgae("render", distributional, "--seconds", 0.4, "--episodes", 2, "--out", tmp_path / "film", *SMALL)
+def test_a_film_of_a_run_is_an_mp4_and_a_gif_in_which_the_robot_moves_over_its_strip(
+    distributional, tmp_path, opengl
+):
+    out = dgae(
+        "render",
+        distributional,
+        "--seconds",
+        0.4,
+        "--episodes",
+        2,
+        "--out",
+        tmp_path / "film",
+        *SMALL,
+    )
     assert re.search(
-        rf"^written to {tmp_path / 'film'}\.mp4 \(.* MB\)\nwritten to {tmp_path / 'film'}\.gif \(.* MB\)\n$", out, re.MULTILINE
+        rf"^written to {tmp_path / 'film'}\.mp4 \(.* MB\)\nwritten to {tmp_path / 'film'}\.gif \(.* MB\)\n$",
+        out,
+        re.MULTILINE,
     )
     film, fps = film_of(tmp_path / "film.mp4")
     assert fps == FPS
-    states = 20  # the small run's episodes are cut there: 0.16 s, 4 frames, and 15 at the end of each
+    states = (
+        20  # the small run's episodes are cut there: 0.16 s, 4 frames, and 15 at the end of each
+    )
     assert film.shape == (2 * (int(states * 0.008 * FPS) + 15), HEIGHT + strip.HEIGHT, WIDTH, 3)
     robot, below = film[:, :HEIGHT].astype(int), film[:, HEIGHT:].astype(int)
     assert np.abs(robot[3] - robot[0]).max() > 60
@@ -91,7 +113,17 @@ def test_a_film_of_a_run_is_an_mp4_and_a_gif_in_which_the_robot_moves_over_its_s
 
 
 def test_runs_side_by_side_and_a_scalar_critic(distributional, scalar, tmp_path, opengl):
-    dgae("render", distributional, "--compare", scalar, "--out", tmp_path / "film.mp4", "--format", "mp4", *SMALL)
+    dgae(
+        "render",
+        distributional,
+        "--compare",
+        scalar,
+        "--out",
+        tmp_path / "film.mp4",
+        "--format",
+        "mp4",
+        *SMALL,
+    )
     assert [path.name for path in tmp_path.iterdir()] == ["film.mp4"]
     film, _ = film_of(tmp_path / "film.mp4")
     assert film.shape[1:] == (HEIGHT + strip.HEIGHT, 2 * WIDTH, 3)
@@ -104,19 +136,26 @@ def test_runs_side_by_side_and_a_scalar_critic(distributional, scalar, tmp_path,
 
 
 def test_learning_is_shown_checkpoint_after_checkpoint(distributional, tmp_path, opengl):
-    dgae("render", distributional, "--during", "--format", "gif", "--out", tmp_path / "film", *SMALL)
+    dgae(
+        "render", distributional, "--during", "--format", "gif", "--out", tmp_path / "film", *SMALL
+    )
     kept = len(list((distributional / "checkpoints").iterdir()))
     assert kept == 2
     assert length(tmp_path / "film.gif") == 19 * 80
 
 
-def test_the_file_of_a_policy_is_filmed_beside_it_and_has_nothing_to_show_from_its_training(distributional, tmp_path, opengl, run):
+def test_the_file_of_a_policy_is_filmed_beside_it_and_has_nothing_to_show_from_its_training(
+    distributional, tmp_path, opengl, run
+):
     config, file = read_config(distributional), tmp_path / "policy.msgpack"
-    found = restore.trained(distributional, config, "newest")
+    found = restore.trained(distributional, config, "latest")
     restore.save_networks(file, config, found, restore.reward_std(found.path, config))
     dgae("render", file, "--format", "gif", *SMALL)
     assert length(tmp_path / "policy-film.gif") > 0
-    assert run("render", file, "--during")[::2] == (2, f"error: --during: must be left out with {file}, a single policy\n")
+    assert run("render", file, "--during")[::2] == (
+        2,
+        f"error: --during: must be left out with {file}, a single policy\n",
+    )
 
 
 def test_every_checkpoint_is_found_and_a_damaged_one_left_out(distributional, tmp_path, capsys):
@@ -127,8 +166,8 @@ def test_every_checkpoint_is_found_and_a_damaged_one_left_out(distributional, tm
         "steps_000000000512.msgpack",
     ]
     shutil.copytree(distributional, tmp_path / "run")
-    newest = last(tmp_path / "run")
-    newest.write_bytes(newest.read_bytes()[:-100])
+    latest = last(tmp_path / "run")
+    latest.write_bytes(latest.read_bytes()[:-100])
     assert [found.path.name for found in restore.kept(tmp_path / "run", config)] == names[:1]
     assert re.fullmatch(r"warning: .*000512\.msgpack.*; left out\n", capsys.readouterr().err)
 
@@ -154,8 +193,14 @@ def test_the_scale_of_rewards_is_that_of_the_training_state(distributional):
         ([".", "--seconds", "nan"], r"--seconds nan: must be a number above 0, up to 600"),
         ([".", "--format", "avi"], r"--format avi: must be one of"),
         ([".", "--during", "--compare", "a"], r"--compare a: must be left out with --during"),
-        ([".", "--during", "--checkpoint", "best"], r"--checkpoint best: must be left out with --during"),
-        ([".", "--checkpoint", "last"], r"--checkpoint last: must be one of (best|newest), (best|newest)"),
+        (
+            [".", "--during", "--checkpoint", "best"],
+            r"--checkpoint best: must be left out with --during",
+        ),
+        (
+            [".", "--checkpoint", "last"],
+            r"--checkpoint last: must be one of (best|latest), (best|latest)",
+        ),
     ],
 )
 def test_render_refuses_bad_input_in_one_line(argv, message, run, monkeypatch, tmp_path):
@@ -173,16 +218,27 @@ def test_render_refuses_a_run_that_gymnasium_cannot_play_a_seed_that_is_not_ther
     assert run("render", tmp_path / "run", "--index", 1)[::2] == (
         2, f"error: --index 1: must be a whole number from 0 to 0, the index of a seed in {tmp_path / 'run'}\n",
     )  # fmt: skip
-    assert re.fullmatch(r"error: --out .*: must be a file in a directory .*\n", run("render", tmp_path / "run", "--out", "/nowhere/x")[2])
+    assert re.fullmatch(
+        r"error: --out .*: must be a file in a directory .*\n",
+        run("render", tmp_path / "run", "--out", "/nowhere/x")[2],
+    )
     (tmp_path / "film.gif").mkdir()
-    code, _, err = run("render", tmp_path / "run", "--out", tmp_path / "film.gif", "--format", "gif")
-    assert (code, err) == (2, f"error: --out {tmp_path / 'film.gif'}: must be a file, not a directory, a link or a device\n")
+    code, _, err = run(
+        "render", tmp_path / "run", "--out", tmp_path / "film.gif", "--format", "gif"
+    )
+    assert (code, err) == (
+        2,
+        f"error: --out {tmp_path / 'film.gif'}: must be a file, not a directory, a link or a device\n",
+    )
     config = json.loads((tmp_path / "run" / "config.json").read_text())
     config |= {"env": "brax:ant", "env_version": None, "physics": "mjx"}
     (tmp_path / "run" / "config.json").write_text(json.dumps(config))
     code, _, err = run("render", tmp_path / "run")
     assert code == 2
-    assert re.fullmatch(r"error: \S+: must be a run of ant, hopper, swimmer, walker2d, which can be filmed; it is one of brax:ant\n", err)
+    assert re.fullmatch(
+        r"error: \S+: must be a run of ant, hopper, swimmer, walker2d, which can be filmed; it is one of brax:ant\n",
+        err,
+    )
 
 
 @pytest.mark.parametrize("module", ["mediapy", "imageio_ffmpeg"])
@@ -190,12 +246,17 @@ def test_a_missing_encoder_is_named_with_how_to_install_it(module, run, monkeypa
     monkeypatch.setitem(sys.modules, module, None)
     code, out, err = run("render", ".")
     assert (code, out) == (2, "")
-    assert re.fullmatch(rf'error: {module.replace("_", "-")} is not installed.*: pip install "dgae_jax\[video\]".*\n', err)
+    assert re.fullmatch(
+        rf'error: {module.replace("_", "-")} is not installed.*: pip install "dgae_jax\[video\]".*\n',
+        err,
+    )
     assert "config.json" in run("render", ".", "--format", "gif")[2]
 
 
 @pytest.mark.parametrize("name", ["render", "figures"])
-def test_without_opengl_a_command_ends_in_one_line(name, distributional, run, monkeypatch, tmp_path):
+def test_without_opengl_a_command_ends_in_one_line(
+    name, distributional, run, monkeypatch, tmp_path
+):
     monkeypatch.delenv(gl.VARIABLE, raising=False)
     monkeypatch.setattr(gl, "draws", lambda _: False)
     monkeypatch.chdir(tmp_path)
@@ -205,7 +266,9 @@ def test_without_opengl_a_command_ends_in_one_line(name, distributional, run, mo
     assert list(tmp_path.iterdir()) == []
 
 
-def test_the_transport_of_mass_is_drawn_without_opengl_with_the_same_bytes_each_time(run, monkeypatch, tmp_path):
+def test_the_transport_of_mass_is_drawn_without_opengl_with_the_same_bytes_each_time(
+    run, monkeypatch, tmp_path
+):
     monkeypatch.setattr(gl, "draws", lambda _: False)
     for name in ("first", "second"):
         code, out, err = run("figures", "--only", "transport", "--out", tmp_path / name)
@@ -221,7 +284,9 @@ def test_a_directory_that_cannot_be_made_is_refused_in_one_line(run, tmp_path):
     (tmp_path / "file").write_text("")
     code, _, err = run("figures", "--only", "transport", "--out", tmp_path / "file")
     assert code == 2
-    assert re.fullmatch(r"error: --out .*file: must be a directory that can be written \(File exists\)\n", err)
+    assert re.fullmatch(
+        r"error: --out .*file: must be a directory that can be written \(File exists\)\n", err
+    )
 
 
 def test_the_four_robots_are_four_different_pictures_on_light_ground(tmp_path, opengl):

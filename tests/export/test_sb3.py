@@ -16,7 +16,9 @@ from dgae_jax.export.sb3 import Sb3VecEnv
 
 
 def hoppers(num_envs, **options):
-    return dg.make_vector_env("hopper", num_envs, physics="native", **{"autoreset_mode": "SameStep", **options})
+    return dg.make_vector_env(
+        "hopper", num_envs, physics="native", **{"autoreset_mode": "SameStep", **options}
+    )
 
 
 def test_an_end_is_told_as_stable_baselines3_expects_it():
@@ -55,7 +57,9 @@ def test_ppo_of_stable_baselines3_learns_to_hop():
     """The return of a random policy and that after 26,624 steps; measured: 15 and 194."""
     torch.set_num_threads(1)
     env = VecMonitor(Sb3VecEnv(hoppers(16)))
-    model = PPO("MlpPolicy", env, n_steps=128, batch_size=256, learning_rate=1e-3, seed=0, device="cpu")
+    model = PPO(
+        "MlpPolicy", env, n_steps=128, batch_size=256, learning_rate=1e-3, seed=0, device="cpu"
+    )
     recent = []
     for _ in range(2):
         model.learn(12 * 16 * 128 if recent else 16 * 128, reset_num_timesteps=False)

@@ -61,7 +61,10 @@ def test_a_scalar_critic_has_a_line_and_no_distribution():
 
 def test_the_rug_is_as_long_as_the_preference_gives_weight():
     blue = strip.COLOURS["blue"]
-    neutral, averse = (coloured(Strip(episode(SPREAD, metric), 480).picture(1), blue) for metric in ("mean", "cvar:0.25"))
+    neutral, averse = (
+        coloured(Strip(episode(SPREAD, metric), 480).picture(1), blue)
+        for metric in ("mean", "cvar:0.25")
+    )
     span = np.ptp(neutral)
     assert np.ptp(averse) == pytest.approx(0.25 * span, abs=0.06 * span)
     assert averse.min() == neutral.min()

@@ -10,7 +10,9 @@ from dgae_jax.export.transport import HIGHER, LOWER, distances
 
 
 @pytest.mark.parametrize(("a", "b"), [(1.0, 3.5), (2.0, -1.0)])
-def test_two_normals_of_the_same_shape_are_as_far_apart_as_their_means_and_the_directional_metric_has_the_sign(a, b):
+def test_two_normals_of_the_same_shape_are_as_far_apart_as_their_means_and_the_directional_metric_has_the_sign(
+    a, b
+):
     found = distances(NormalDist(a, 0.7), NormalDist(b, 0.7))
     assert found.wasserstein == pytest.approx(abs(a - b), rel=1e-5)
     assert found.forward == pytest.approx(a - b, rel=1e-5)
@@ -28,8 +30,14 @@ def test_both_columns_print_the_same_distance_and_opposite_directions():
     assert len(titles) == 2
     gap = HIGHER.mean - LOWER.mean
     assert all(f"d_1 = {gap:.2f}" in title for title in titles)
-    assert [f"d(F_U, G_V) = {{{sign}}}{gap:.2f}" in title for sign, title in zip("-+", titles, strict=True)] == [True, True]
-    assert [f"d(G_V, F_U) = {{{sign}}}{gap:.2f}" in title for sign, title in zip("+-", titles, strict=True)] == [True, True]
+    assert [
+        f"d(F_U, G_V) = {{{sign}}}{gap:.2f}" in title
+        for sign, title in zip("-+", titles, strict=True)
+    ] == [True, True]
+    assert [
+        f"d(G_V, F_U) = {{{sign}}}{gap:.2f}" in title
+        for sign, title in zip("+-", titles, strict=True)
+    ] == [True, True]
 
 
 def test_arrows_of_the_plan_lead_from_each_quantile_of_u_to_the_same_of_v():

@@ -33,7 +33,9 @@ MODES = [mode.value for mode in AutoresetMode]
 @functools.cache
 def hoppers(mode="NextStep", num_envs=3, limit=20):
     """Compiled once; whoever takes them resets them."""
-    return dg.make_vector_env("hopper", num_envs, physics="native", autoreset_mode=mode, max_episode_steps=limit)
+    return dg.make_vector_env(
+        "hopper", num_envs, physics="native", autoreset_mode=mode, max_episode_steps=limit
+    )
 
 
 def actions_of(env, dtype=np.float32):
@@ -56,8 +58,10 @@ class Placed(gymnasium.Wrapper):
 def gymnasiums_own(name, version, mode, num_envs, limit):
     def make():
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # that v4 is not the newest version is known
-            return Placed(gymnasium.make(f"{GYM_TASKS[name].NAME}-{version}", max_episode_steps=limit))
+            warnings.simplefilter("ignore")  # that v4 is not the latest version is known
+            return Placed(
+                gymnasium.make(f"{GYM_TASKS[name].NAME}-{version}", max_episode_steps=limit)
+            )
 
     return SyncVectorEnv([make] * num_envs, autoreset_mode=mode)
 
@@ -75,22 +79,40 @@ SAID_OTHERWISE = {"distance_from_origin", "z_distance_from_origin", "forward_rew
 
 def assert_infos_agree(ours, theirs, version):
     """What Gymnasium says, we say, as arrays of the same kind; only v5 says something at a reset too."""
-    assert {name.removeprefix("_") for name in set(theirs) - set(ours)} <= SAID_OTHERWISE or version == "v5"
+    assert {
+        name.removeprefix("_") for name in set(theirs) - set(ours)
+    } <= SAID_OTHERWISE or version == "v5"
     for name in set(theirs) & set(ours):
         mask = ours.get(f"_{name}")
         if name.startswith("_"):
             assert ours[name].dtype == theirs[name].dtype == bool
-            assert_array_equal(ours[name], theirs[name] & ours[name] if version == "v5" else theirs[name])
+            assert_array_equal(
+                ours[name], theirs[name] & ours[name] if version == "v5" else theirs[name]
+            )
         elif isinstance(theirs[name], dict):
             assert_infos_agree(ours[name], theirs[name], version)
         elif name == "final_obs":
             assert ours[name].dtype == theirs[name].dtype == object
-            assert [x is None for x in ours[name]] == [x is None for x in theirs[name]] == list(~mask)
-            assert_allclose(np.stack(ours[name][mask]), np.stack(theirs[name][mask]), rtol=1e-10, atol=1e-10)
+            assert (
+                [x is None for x in ours[name]] == [x is None for x in theirs[name]] == list(~mask)
+            )
+            assert_allclose(
+                np.stack(ours[name][mask]), np.stack(theirs[name][mask]), rtol=1e-10, atol=1e-10
+            )
         else:
             assert ours[name].dtype == theirs[name].dtype
-            late = version == "v5" and "reward_contact" in ours and name in ("x_position", "y_position")  # the reward's, not the last
-            assert_allclose(ours[name][mask], theirs[name][mask], rtol=1e-10, atol=1e-2 if late else 1e-10, err_msg=name)
+            late = (
+                version == "v5"
+                and "reward_contact" in ours
+                and name in ("x_position", "y_position")
+            )  # the reward's, not the last
+            assert_allclose(
+                ours[name][mask],
+                theirs[name][mask],
+                rtol=1e-10,
+                atol=1e-2 if late else 1e-10,
+                err_msg=name,
+            )
             assert not ours[name][~mask].any()
 
 
@@ -109,13 +131,27 @@ CASES = [
 
 
 @pytest.mark.parametrize(("name", "version", "mode"), CASES)
-def test_in_float64_native_is_gymnasiums_own_vector_environment_through_ends_of_episodes(name, version, mode):
+def test_in_float64_native_is_gymnasiums_own_vector_environment_through_ends_of_episodes(
+    name, version, mode
+):
     count, limit, falls, limits = 3, 20, 0, 0
     with jax.enable_x64(True):
-        ours = dg.make_vector_env(name, count, physics="native", version=version, autoreset_mode=mode, max_episode_steps=limit)
+        ours = dg.make_vector_env(
+            name,
+            count,
+            physics="native",
+            version=version,
+            autoreset_mode=mode,
+            max_episode_steps=limit,
+        )
         theirs = gymnasiums_own(name, version, mode, count, limit)
         assert ours.metadata["autoreset_mode"] is theirs.metadata["autoreset_mode"]
-        for space in ("observation_space", "action_space", "single_observation_space", "single_action_space"):
+        for space in (
+            "observation_space",
+            "action_space",
+            "single_observation_space",
+            "single_action_space",
+        ):
             assert getattr(ours, space) == getattr(theirs, space)
         obs, _ = ours.reset(seed=0)
         lay_down(theirs, ours)
@@ -128,14 +164,19 @@ def test_in_float64_native_is_gymnasiums_own_vector_environment_through_ends_of_
             if mode == "Disabled" and (mask := step[2] | step[3]).any():
                 obs, _ = ours.reset(options={"reset_mask": mask})
                 lay_down(theirs, ours)
-                assert_allclose(theirs.reset(options={"reset_mask": mask})[0], obs, rtol=1e-10, atol=1e-10)
+                assert_allclose(
+                    theirs.reset(options={"reset_mask": mask})[0], obs, rtol=1e-10, atol=1e-10
+                )
         theirs.close()
     assert limits >= count
     assert falls > 0 or name != "hopper"
 
 
 def played(env, steps, **reset):
-    return [env.reset(**reset)[0], *(env.step(action)[:4] for _, action in zip(range(steps), actions_of(env), strict=False))]
+    return [
+        env.reset(**reset)[0],
+        *(env.step(action)[:4] for _, action in zip(range(steps), actions_of(env), strict=False)),
+    ]
 
 
 def test_equal_seeds_give_equal_bits_and_others_others():
@@ -176,7 +217,9 @@ def test_worlds_are_moved_to_poses():
     env = hoppers()
     env.reset(seed=0)
     qpos, qvel = np.arange(18.0).reshape(3, 6) / 8, np.full((3, 6), 20.0)
-    assert_array_equal(env.set_state(qpos, qvel), np.concatenate([qpos[:, 1:], np.full((3, 6), 10.0)], axis=1))
+    assert_array_equal(
+        env.set_state(qpos, qvel), np.concatenate([qpos[:, 1:], np.full((3, 6), 10.0)], axis=1)
+    )
     assert_array_equal(env.state.pipeline_state.qvel, qvel)
 
 
@@ -201,7 +244,10 @@ class OneWorld(gymnasium.Env):
 
     def __init__(self):
         self.vector = hoppers("Disabled", num_envs=1)
-        self.observation_space, self.action_space = self.vector.single_observation_space, self.vector.single_action_space
+        self.observation_space, self.action_space = (
+            self.vector.single_observation_space,
+            self.vector.single_action_space,
+        )
 
     def reset(self, *, seed=None, options=None):
         super().reset(seed=seed)
@@ -210,7 +256,13 @@ class OneWorld(gymnasium.Env):
 
     def step(self, action):
         obs, reward, terminated, truncated, infos = self.vector.step(action[None])
-        return obs[0], reward[0], bool(terminated[0]), bool(truncated[0]), {name: x[0] for name, x in infos.items()}
+        return (
+            obs[0],
+            reward[0],
+            bool(terminated[0]),
+            bool(truncated[0]),
+            {name: x[0] for name, x in infos.items()},
+        )
 
 
 def test_one_world_passes_gymnasiums_checks():
@@ -219,7 +271,9 @@ def test_one_world_passes_gymnasiums_checks():
     with warnings.catch_warnings(record=True) as said:
         warnings.simplefilter("always")
         check_env(env)
-    assert [each.message for each in said if "infinity" not in str(each.message)] == []  # observations have no bounds, as Gymnasium's
+    assert [
+        each.message for each in said if "infinity" not in str(each.message)
+    ] == []  # observations have no bounds, as Gymnasium's
 
 
 def test_gymnasiums_wrappers_count_and_normalise_over_it():
@@ -229,18 +283,31 @@ def test_gymnasiums_wrappers_count_and_normalise_over_it():
     for _, action in zip(range(60), actions_of(env), strict=False):
         obs, _, terminated, truncated, infos = env.step(action)
         seen.append(obs)
-        lengths += infos["episode"]["l"][terminated | truncated].tolist() if "episode" in infos else []
+        lengths += (
+            infos["episode"]["l"][terminated | truncated].tolist() if "episode" in infos else []
+        )
     assert len(lengths) >= 6
     assert set(range(1, 21)) >= set(lengths)
     assert np.abs(np.mean(seen[30:], axis=(0, 1))).max() < 1
 
 
 def test_gymnasium_makes_it_by_name_with_its_time_limit():
-    env = gymnasium.make_vec("dgae_jax.export.vector:dgae_jax/Hopper-v5", num_envs=2, physics="native", healthy_reward=3.0)
-    assert (env.spec.id, env.num_envs, env.spec.kwargs["max_episode_steps"]) == ("dgae_jax/Hopper-v5", 2, 1000)
+    env = gymnasium.make_vec(
+        "dgae_jax.export.vector:dgae_jax/Hopper-v5",
+        num_envs=2,
+        physics="native",
+        healthy_reward=3.0,
+    )
+    assert (env.spec.id, env.num_envs, env.spec.kwargs["max_episode_steps"]) == (
+        "dgae_jax/Hopper-v5",
+        2,
+        1000,
+    )
     assert env.env.dt == 0.008
     assert env.env._healthy_reward == 3
-    assert {f"dgae_jax/{task.NAME}-{v}" for task in GYM_TASKS.values() for v in ("v4", "v5")} <= set(gymnasium.registry)
+    assert {
+        f"dgae_jax/{task.NAME}-{v}" for task in GYM_TASKS.values() for v in ("v4", "v5")
+    } <= set(gymnasium.registry)
 
 
 @pytest.mark.parametrize(
@@ -250,8 +317,14 @@ def test_gymnasium_makes_it_by_name_with_its_time_limit():
         ({"physics": "bullet"}, "physics bullet: must be one of jax"),
         ({"num_envs": 0}, "num_envs 0: must be a whole number of at least 1"),
         ({"max_episode_steps": 0}, "max_episode_steps 0: must be a whole number of at least 1"),
-        ({"autoreset_mode": "Never"}, "autoreset_mode Never: must be one of NextStep, SameStep, Disabled"),
-        ({"render_mode": "human"}, "render_mode human: must be left out, or rgb_array with ant, hopper"),
+        (
+            {"autoreset_mode": "Never"},
+            "autoreset_mode Never: must be one of NextStep, SameStep, Disabled",
+        ),
+        (
+            {"render_mode": "human"},
+            "render_mode human: must be left out, or rgb_array with ant, hopper",
+        ),
     ],
 )
 def test_what_cannot_be_made_is_refused_with_what_can(options, message):
@@ -266,7 +339,10 @@ def test_what_cannot_be_made_is_refused_with_what_can(options, message):
         ({"seed": [1, 2]}, "seed [1, 2]: must be a number of at least 0, or 3 of them"),
         ({"seed": [1, 2, 0.5]}, "seed [1, 2, 0.5]: must be"),
         ({"options": {"pose": 1}}, "options 'pose': must be reset_mask, or left out"),
-        ({"options": {"reset_mask": np.array([True])}}, "reset_mask [ True]: must be 3 booleans, one of them true"),
+        (
+            {"options": {"reset_mask": np.array([True])}},
+            "reset_mask [ True]: must be 3 booleans, one of them true",
+        ),
         ({"options": {"reset_mask": np.zeros(3, bool)}}, "reset_mask [False False False]: must be"),
         ({"options": {"reset_mask": np.ones(3)}}, "reset_mask [1. 1. 1.]: must be"),
     ],
@@ -277,7 +353,9 @@ def test_a_reset_that_does_not_fit_is_refused(options, message):
 
 
 def test_what_comes_at_the_wrong_time_is_refused():
-    env = dg.make_vector_env("hopper", 3, physics="native", autoreset_mode="Disabled", max_episode_steps=1)
+    env = dg.make_vector_env(
+        "hopper", 3, physics="native", autoreset_mode="Disabled", max_episode_steps=1
+    )
     still = np.zeros((3, 3), np.float32)
     with pytest.raises(ResetNeeded, match="must be reset before"):
         env.step(still)
@@ -301,9 +379,13 @@ def test_the_public_names_are_there_before_gymnasium_is_imported():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("physics", [pytest.param(name, marks=WARP if name == "mjx-warp" else ()) for name in ENGINES])
+@pytest.mark.parametrize(
+    "physics", [pytest.param(name, marks=WARP if name == "mjx-warp" else ()) for name in ENGINES]
+)
 def test_every_engine_steps_as_native_does(physics):
-    ours, native = (dg.make_vector_env("hopper", 2, physics=name, version="v5") for name in (physics, "native"))
+    ours, native = (
+        dg.make_vector_env("hopper", 2, physics=name, version="v5") for name in (physics, "native")
+    )
     for env in (ours, native):
         env.reset(seed=0)
     for _, action in zip(range(5), actions_of(ours), strict=False):
@@ -331,7 +413,9 @@ assert one.shape == two.shape == (480, 480, 3)
 assert one.std() > 10 and (one != two).any()
 env.close()
 """
-    subprocess.run([sys.executable, "-c", program], check=True, env={**os.environ, gl.VARIABLE: backend})
+    subprocess.run(
+        [sys.executable, "-c", program], check=True, env={**os.environ, gl.VARIABLE: backend}
+    )
 
 
 def test_a_time_limit_of_the_tasks_own_is_a_truncation():
@@ -346,6 +430,7 @@ def test_a_time_limit_of_the_tasks_own_is_a_truncation():
 
 def test_tasks_that_live_on_the_host_are_refused():
     with pytest.raises(
-        ValueError, match=r"name gymnasium:Pendulum-v1: must be a task in JAX; gymnasium\.make_vec makes those of Gymnasium"
+        ValueError,
+        match=r"name gymnasium:Pendulum-v1: must be a task in JAX; gymnasium\.make_vec makes those of Gymnasium",
     ):
         dg.make_vector_env("gymnasium:Pendulum-v1", 2)

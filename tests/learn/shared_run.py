@@ -7,8 +7,8 @@ import jax
 import numpy as np
 
 import dgae_jax as dg
-from dgae_jax.configs.build import make_trainer, seed_keys
 from dgae_jax.learn import devices
+from dgae_jax.learn.build import make_trainer, seed_keys
 from tests.helpers import small
 
 ITERATIONS = 10
@@ -16,11 +16,15 @@ ITERATIONS = 10
 
 def trained(algo, count, seeds=1, iterations=ITERATIONS):
     """The numbers of both networks after so many iterations, and the metrics."""
-    config = dataclasses.replace(small(algo), num_envs=8, horizon=16, num_seeds=seeds)
-    trainer = make_trainer(dg.make_env("hopper", physics="native"), ITERATIONS, devices.make_mesh(count))
+    config = dataclasses.replace(small(algo), num_envs=8, num_steps=16, num_seeds=seeds)
+    trainer = make_trainer(
+        dg.make_env("hopper", physics="native"), ITERATIONS, devices.make_mesh(count)
+    )
     state, rows = trainer.dispatch(config, trainer.init(config, seed_keys(config)), iterations)
     assert len(state.episodes.total.sharding.device_set) == count
-    return np.concatenate([x.ravel() for x in jax.tree.leaves((state.policy.params, state.critic.params))]), rows
+    return np.concatenate(
+        [x.ravel() for x in jax.tree.leaves((state.policy.params, state.critic.params))]
+    ), rows
 
 
 def main(path):

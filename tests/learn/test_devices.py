@@ -17,7 +17,12 @@ def found(tmp_path_factory):
     file = tmp_path_factory.mktemp("shared") / "runs.npz"
     environment = {**os.environ, "JAX_PLATFORMS": "cpu"}
     done = subprocess.run(
-        [sys.executable, "-m", "tests.learn.shared_run", file], cwd=ROOT, env=environment, capture_output=True, text=True, timeout=300
+        [sys.executable, "-m", "tests.learn.shared_run", file],
+        cwd=ROOT,
+        env=environment,
+        capture_output=True,
+        text=True,
+        timeout=300,
     )
     assert done.returncode == 0, done.stderr
     return np.load(file)
@@ -26,7 +31,9 @@ def found(tmp_path_factory):
 @pytest.mark.slow
 @pytest.mark.parametrize("count", [2, 4])
 @pytest.mark.parametrize("algo", ["dppo", "dtrpo"])
-def test_after_ten_iterations_the_networks_are_those_of_one_device_up_to_rounding(algo, count, found):
+def test_after_ten_iterations_the_networks_are_those_of_one_device_up_to_rounding(
+    algo, count, found
+):
     assert_allclose(found[f"{algo} {count}"], found[f"{algo} 1"], atol=1e-5)
     assert_allclose(found[f"{algo} {count} reward"], found[f"{algo} 1 reward"], atol=1e-5)
     assert np.abs(found[f"{algo} 1"] - found[f"{algo} start"]).max() > 1e-3

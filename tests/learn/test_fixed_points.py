@@ -35,7 +35,9 @@ def fixed_point(kind, target, lam, end="terminal"):
     critic = CRITICS[kind].build(3, hidden=(), target=TARGETS[target].build, **options)
     obs, reward, terminated, next_obs = episodes(end)
     lam = lam if critic.lam is None else critic.lam
-    discount, trace = decay(terminated, jnp.zeros_like(terminated).at[-1].set(True), gamma=0.5, lam=lam)
+    discount, trace = decay(
+        terminated, jnp.zeros_like(terminated).at[-1].set(True), gamma=0.5, lam=lam
+    )
     steps = 1500
     optimizer = optax.adam(optax.cosine_decay_schedule(0.05, steps))
 
@@ -43,17 +45,31 @@ def fixed_point(kind, target, lam, end="terminal"):
         params, opt_state = carry
         z, z_next = (critic.predict(params, x) for x in (obs, next_obs))
         fitted_to = critic.target(key, reward, discount, trace, z, z_next)
-        batch = Batch(obs, obs, reward, reward, z.mean(-1), fitted_to, reward, discount, next_obs, jnp.ones_like(terminated))
+        batch = Batch(
+            obs,
+            obs,
+            reward,
+            reward,
+            z.mean(-1),
+            fitted_to,
+            reward,
+            discount,
+            next_obs,
+            jnp.ones_like(terminated),
+        )
         batch = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), batch)
         gradient = jax.grad(lambda p: critic.loss(p, batch)[0])(params)
         updates, opt_state = optimizer.update(gradient, opt_state)
         return (optax.apply_updates(params, updates), opt_state), None
 
     params = critic.init(jax.random.key(0))
-    (params, _), _ = jax.jit(lambda c: jax.lax.scan(iteration, c, jax.random.split(jax.random.key(1), steps)))(
-        (params, optimizer.init(params))
-    )
-    return {name: jnp.sort(critic.predict(params, x)) for name, x in (("first", FIRST), ("second", SECOND), ("end", END))}
+    (params, _), _ = jax.jit(
+        lambda c: jax.lax.scan(iteration, c, jax.random.split(jax.random.key(1), steps))
+    )((params, optimizer.init(params)))
+    return {
+        name: jnp.sort(critic.predict(params, x))
+        for name, x in (("first", FIRST), ("second", SECOND), ("end", END))
+    }
 
 
 @pytest.mark.parametrize("kind", ["quantile", "ordered"])
@@ -78,7 +94,9 @@ def test_the_critic_learns_the_true_quantiles(kind, target, lam, end):
 
 def test_the_scalar_return_with_a_bootstrap_loses_the_spread_of_what_it_bootstraps():
     # λ = 0: all quantiles see r + γ E[G(second)] = ±1
-    assert_allclose(fixed_point("quantile", "lambda-return", 0.0)["first"], [-1, -1, 1, 1], atol=0.1)
+    assert_allclose(
+        fixed_point("quantile", "lambda-return", 0.0)["first"], [-1, -1, 1, 1], atol=0.1
+    )
 
 
 def test_the_shifted_target_counts_the_spread_of_the_bootstrap_twice():

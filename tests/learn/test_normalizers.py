@@ -21,7 +21,11 @@ def draws(distribution, count=12, seed=0):
 def followed(rollouts):
     """The statistics of observations after several rollouts."""
     start = normalizers.observations(rollouts.shape[-1])
-    return jax.lax.scan(lambda state, rollout: (normalizers.observe(state, rollout, ALL_VALID), None), start, rollouts)[0]
+    return jax.lax.scan(
+        lambda state, rollout: (normalizers.observe(state, rollout, ALL_VALID), None),
+        start,
+        rollouts,
+    )[0]
 
 
 @jax.jit
@@ -42,7 +46,12 @@ def test_observation_statistics_are_those_of_all_samples_seen(key):
     for rollout in obs:
         state = normalizers.observe(state, rollout, jnp.ones((10, 5), bool))
     flat = np.asarray(obs).reshape(-1, 2)
-    assert_allclose(normalizers.normalize(state, obs[0]), (np.asarray(obs[0]) - flat.mean(0)) / flat.std(0), rtol=1e-3, atol=1e-4)
+    assert_allclose(
+        normalizers.normalize(state, obs[0]),
+        (np.asarray(obs[0]) - flat.mean(0)) / flat.std(0),
+        rtol=1e-3,
+        atol=1e-4,
+    )
 
 
 def test_without_statistics_observations_pass_untouched():
@@ -53,7 +62,9 @@ def test_without_statistics_observations_pass_untouched():
 def test_rewards_are_divided_by_the_standard_deviation_of_the_discounted_return(key):
     reward = jax.random.normal(key, (50, 3)) + 1
     done = jax.random.bernoulli(key, 0.1, (50, 3)).astype(jnp.float32)
-    scale, scaled = normalizers.rescale(normalizers.reward_scale(3), reward, done, jnp.ones((50, 3), bool), 0.9)
+    scale, scaled = normalizers.rescale(
+        normalizers.reward_scale(3), reward, done, jnp.ones((50, 3), bool), 0.9
+    )
     trail, running = np.zeros((50, 3)), np.zeros(3)
     for t in range(50):
         running = 0.9 * running + np.asarray(reward[t])
@@ -65,7 +76,9 @@ def test_rewards_are_divided_by_the_standard_deviation_of_the_discounted_return(
 def test_a_quarantined_step_does_not_count_in_the_reward_scale():
     # one world, γ = 0: the returns are the rewards 1, 3 and, in quarantine, 0; the standard deviation of 1 and 3 is 1
     reward, valid = jnp.array([[1.0], [0.0], [3.0]]), jnp.array([[True], [False], [True]])
-    scale, scaled = normalizers.rescale(normalizers.reward_scale(1), reward, 1.0 - valid, valid, 0.0)
+    scale, scaled = normalizers.rescale(
+        normalizers.reward_scale(1), reward, 1.0 - valid, valid, 0.0
+    )
     assert_allclose(scale.returns.std, 1.0, rtol=1e-6)
     assert_allclose(scaled, reward, rtol=1e-6)
 
@@ -109,7 +122,10 @@ def test_one_observation_out_of_all_proportion_at_most_doubles_the_variance(at, 
 @pytest.mark.parametrize("at", [0, 1, 11])
 def test_one_reward_out_of_all_proportion_at_most_doubles_the_variance_of_the_returns(at, size):
     rewards = draws(ORDINARY["normal"])[..., 0]
-    usual, spoilt = rescaled(rewards).returns.std, rescaled(rewards.at[at, 40, 3].set(size)).returns.std
+    usual, spoilt = (
+        rescaled(rewards).returns.std,
+        rescaled(rewards.at[at, 40, 3].set(size)).returns.std,
+    )
     assert 0.95 * usual < spoilt < 1.5 * usual
 
 
@@ -120,8 +136,14 @@ def test_a_few_different_outliers_in_the_first_rollout_do_no_more():
 
 
 def test_the_scale_follows_when_all_of_the_data_grow():
-    small, large = draws(ORDINARY["normal"], count=20), 1e4 * draws(ORDINARY["normal"], count=4, seed=2)
-    state, plain = followed(jnp.concatenate([small, large])), np.asarray(jnp.concatenate([small, large]), np.float64).std()
+    small, large = (
+        draws(ORDINARY["normal"], count=20),
+        1e4 * draws(ORDINARY["normal"], count=4, seed=2),
+    )
+    state, plain = (
+        followed(jnp.concatenate([small, large])),
+        np.asarray(jnp.concatenate([small, large]), np.float64).std(),
+    )
     assert 0.7 * plain < state.std[0] < plain
 
 

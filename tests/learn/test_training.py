@@ -7,14 +7,21 @@ import pytest
 from numpy.testing import assert_allclose
 
 import dgae_jax as dg
-from dgae_jax.configs.build import make_task, make_trainer, seed_keys
+from dgae_jax.learn.build import make_task, make_trainer, seed_keys
 from tests.parity import WARP
 
 
 @cache
 def returns(physics):
     """Mean return of each of ten iterations of DPPO on Hopper."""
-    config = dg.Config(env="hopper", algo="dppo", physics=physics, num_envs=16, horizon=128, total_steps=10 * 16 * 128)
+    config = dg.Config(
+        env="hopper",
+        algo="dppo",
+        physics=physics,
+        num_envs=16,
+        num_steps=128,
+        total_steps=10 * 16 * 128,
+    )
     trainer = make_trainer(make_task(config), 10)
     _, rows = trainer.dispatch(config, trainer.init(config, seed_keys(config)), 10)
     return np.asarray(rows["episode_return"])[:, 0]

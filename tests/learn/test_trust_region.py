@@ -9,8 +9,8 @@ from jax.flatten_util import ravel_pytree
 from numpy.testing import assert_allclose
 
 from dgae_jax.learn.networks import SharedCovariance, gaussian_policy
-from dgae_jax.learn.types import Batch, Fit
-from dgae_jax.learn.updates import fisher_product, natural_gradient, surrogate, trust_region
+from dgae_jax.learn.types import Batch, TrainableState
+from dgae_jax.learn.updates import fisher_product, surrogate, trpo_update, trust_region
 from dgae_jax.maths import gaussian
 from tests.helpers import distance
 
@@ -27,18 +27,33 @@ def example(seed=0, count=200):
     advantage = jnp.sin(action[:, 0] + obs[:, 1]) - 0.5 * action[:, 1] ** 2
     advantage = (advantage - advantage.mean()) / advantage.std()
     column, valid = advantage[:, None], jnp.ones(count, bool)
-    return params, Batch(obs, action, gaussian.log_prob(here, action), advantage, advantage, column, advantage, advantage, obs, valid)
+    return params, Batch(
+        obs,
+        action,
+        gaussian.log_prob(here, action),
+        advantage,
+        advantage,
+        column,
+        advantage,
+        advantage,
+        obs,
+        valid,
+    )
 
 
-SEARCH = {"damping": 0.1, "cg_iterations": 30, "backtracks": 10, "fisher_every": 1}
+SEARCH = {"damping": 0.1, "cg_iterations": 30, "max_backtracks": 10, "fisher_every": 1}
 
 
 def update(loss=None, radius=0.01, **changes):
-    return trust_region(POLICY, loss or surrogate(POLICY), radius=lambda steps: radius, **{**SEARCH, **changes})
+    return trust_region(
+        POLICY, loss or surrogate(POLICY), radius=lambda steps: radius, **{**SEARCH, **changes}
+    )
 
 
 def move(step, params, batch):
-    fit, info = jax.jit(step.step)(jax.random.key(0), Fit(params, step.init(params)), batch)
+    fit, info = jax.jit(step.step)(
+        jax.random.key(0), TrainableState(params, step.init(params)), batch
+    )
     return fit.params, info
 
 
@@ -50,7 +65,9 @@ def test_the_fisher_product_is_the_hessian_of_the_divergence():
     params, batch = example()
     flat, unravel = ravel_pytree(params)
     here = POLICY.apply(params, batch.obs)
-    hessian = jax.jit(jax.hessian(lambda x: gaussian.kl(here, POLICY.apply(unravel(x), batch.obs)).mean()))(flat)
+    hessian = jax.jit(
+        jax.hessian(lambda x: gaussian.kl(here, POLICY.apply(unravel(x), batch.obs)).mean())
+    )(flat)
     product = fisher_product(POLICY, params, batch.obs, 0.0)
     columns = jax.jit(jax.vmap(lambda v: ravel_pytree(product(unravel(v)))[0]))(jnp.eye(len(flat)))
     assert_allclose(columns, hessian, atol=1e-5)
@@ -80,9 +97,14 @@ def test_a_search_that_fails_leaves_the_parameters_bit_for_bit():
 
     def nowhere_better(p, batch):
         value, info = surrogate(POLICY)(p, batch)
-        return value + jax.lax.stop_gradient(jnp.where((ravel_pytree(p)[0] == start).all(), 0, 10)), info
+        return value + jax.lax.stop_gradient(
+            jnp.where((ravel_pytree(p)[0] == start).all(), 0, 10)
+        ), info
 
-    for failing, data in ((update(nowhere_better), batch), (update(), batch._replace(advantage=jnp.zeros_like(batch.advantage)))):
+    for failing, data in (
+        (update(nowhere_better), batch),
+        (update(), batch._replace(advantage=jnp.zeros_like(batch.advantage))),
+    ):
         new, info = move(failing, params, data)
         assert info["accepted"] == 0
         assert info["kl"] == 0
@@ -92,8 +114,12 @@ def test_a_search_that_fails_leaves_the_parameters_bit_for_bit():
 
 def test_a_step_that_is_too_long_is_halved():
     params, batch = example()
-    scaled = batch._replace(obs=batch.obs.at[::2].multiply(30))  # the Fisher matrix sees every second sample only
-    new, info = move(update(fisher_every=2, radius=1.0), params, scaled._replace(obs=jnp.roll(scaled.obs, 1, 0)))
+    scaled = batch._replace(
+        obs=batch.obs.at[::2].multiply(30)
+    )  # the Fisher matrix sees every second sample only
+    new, info = move(
+        update(fisher_every=2, radius=1.0), params, scaled._replace(obs=jnp.roll(scaled.obs, 1, 0))
+    )
     assert info["halvings"] >= 1
     assert divergence(params, new, scaled._replace(obs=jnp.roll(scaled.obs, 1, 0))) <= 1.0
 
@@ -101,17 +127,25 @@ def test_a_step_that_is_too_long_is_halved():
 def independent_step(params, batch, radius, damping):
     """The natural gradient step in numpy float64: Jacobians by central differences, dense matrices, no autodiff."""
     flat, unravel = ravel_pytree(params)
-    flat, obs, action, advantage = (np.asarray(x, np.float64) for x in (flat, batch.obs, batch.action, batch.advantage))
+    flat, obs, action, advantage = (
+        np.asarray(x, np.float64) for x in (flat, batch.obs, batch.action, batch.advantage)
+    )
     layout = unravel(jnp.arange(len(flat), dtype=jnp.float32))["params"]
     at = {name: np.asarray(leaf).astype(int) for name, leaf in (("s", layout["log_std"]),)}
     hidden, out = layout["Torso_0"]["Dense_0"], layout["Dense_0"]
-    at |= {f"{n}{k[0]}": np.asarray(layer[k]).astype(int) for n, layer in (("h", hidden), ("o", out)) for k in ("kernel", "bias")}
+    at |= {
+        f"{n}{k[0]}": np.asarray(layer[k]).astype(int)
+        for n, layer in (("h", hidden), ("o", out))
+        for k in ("kernel", "bias")
+    }
 
     def mean(x):
         return np.tanh(obs @ x[at["hk"]] + x[at["hb"]]) @ x[at["ok"]] + x[at["ob"]]
 
     eye, step = np.eye(len(flat)), 1e-6
-    jacobian = np.stack([(mean(flat + step * e) - mean(flat - step * e)) / (2 * step) for e in eye], -1)  # [B, A, P]
+    jacobian = np.stack(
+        [(mean(flat + step * e) - mean(flat - step * e)) / (2 * step) for e in eye], -1
+    )  # [B, A, P]
     std = np.exp(flat[at["s"]])
     standard = (action - mean(flat)) / std
     score = np.einsum("ba,bap->bp", standard / std, jacobian)
@@ -130,7 +164,9 @@ def test_the_step_is_that_of_an_independent_implementation(seed):
     new, info = move(update(radius=1e-4, cg_iterations=60), params, batch)
     assert info["accepted"] == 1
     assert info["halvings"] == 0
-    ours = np.asarray(ravel_pytree(new)[0], np.float64) - np.asarray(ravel_pytree(params)[0], np.float64)
+    ours = np.asarray(ravel_pytree(new)[0], np.float64) - np.asarray(
+        ravel_pytree(params)[0], np.float64
+    )
     theirs = independent_step(params, batch, 1e-4, 0.1)
     assert ours @ theirs / np.linalg.norm(ours) / np.linalg.norm(theirs) > 0.999
     assert_allclose(np.linalg.norm(ours), np.linalg.norm(theirs), rtol=0.01)
@@ -150,7 +186,9 @@ def step_of_sb3_contrib(params, batch, radius, damping):
         return (new.log_std - old.log_std + (p + (old.mean - new.mean) ** 2) / (2 * q) - 0.5).mean()
 
     gradient = jax.grad(lambda x: surrogate(POLICY)(unravel(x), batch)[0])(flat)
-    damped = np.asarray(jax.jit(jax.hessian(divergence))(flat) + damping * jnp.eye(len(flat)), np.float64)
+    damped = np.asarray(
+        jax.jit(jax.hessian(divergence))(flat) + damping * jnp.eye(len(flat)), np.float64
+    )
     direction = scipy.linalg.solve(damped, -np.asarray(gradient, np.float64), assume_a="pos")
     return direction * np.sqrt(2 * radius / (direction @ damped @ direction))
 
@@ -160,9 +198,13 @@ def test_sb3_contribs_radius_and_damping_are_ours_over_the_number_of_action_dime
     # (F/A + d) x = g and the radius r there, (F + A·d) y = g and A·r here: y = x/A, and the lengths make up for it
     params, batch = example(seed)
     actions, radius, damping = batch.action.shape[-1], 5e-5, 0.1
-    new, info = move(update(radius=actions * radius, damping=actions * damping, cg_iterations=60), params, batch)
+    new, info = move(
+        update(radius=actions * radius, damping=actions * damping, cg_iterations=60), params, batch
+    )
     assert (info["accepted"], info["halvings"]) == (1, 0)
-    ours = np.asarray(ravel_pytree(new)[0], np.float64) - np.asarray(ravel_pytree(params)[0], np.float64)
+    ours = np.asarray(ravel_pytree(new)[0], np.float64) - np.asarray(
+        ravel_pytree(params)[0], np.float64
+    )
     theirs = step_of_sb3_contrib(params, batch, radius, damping)
     assert np.linalg.norm(ours - theirs) < 1e-3 * np.linalg.norm(theirs)
     unscaled = step_of_sb3_contrib(params, batch, actions * radius, actions * damping)
@@ -171,8 +213,8 @@ def test_sb3_contribs_radius_and_damping_are_ours_over_the_number_of_action_dime
 
 def test_the_radius_falls_from_step_to_step_in_the_last_fifth_of_a_run():
     params, batch = example()
-    rule = natural_gradient(POLICY, 20, radius=0.01, learning_rate_end=0.0, **SEARCH)
-    fit, moved = Fit(params, rule.init(params)), []
+    rule = trpo_update(POLICY, 20, radius=0.01, learning_rate_end=0.0, **SEARCH)
+    fit, moved = TrainableState(params, rule.init(params)), []
     for _ in range(20):  # always from the same policy, that which acted
         fit, info = jax.jit(rule.step)(jax.random.key(0), fit._replace(params=params), batch)
         moved.append(float(info["kl"]))

@@ -8,7 +8,7 @@ import dgae_jax as dg
 from dgae_jax.configs.parts import CRITICS, TARGETS
 from dgae_jax.learn import critics
 from dgae_jax.learn.networks import SharedCovariance, StateCovariance, gaussian_policy
-from dgae_jax.learn.types import Batch, Fit
+from dgae_jax.learn.types import Batch, TrainableState
 from dgae_jax.learn.updates import adam, descent, sgd, surrogate
 from dgae_jax.maths import gaussian
 from tests.helpers import distance
@@ -31,13 +31,28 @@ def batch(policy, params, key):
     action = gaussian.sample(key, distribution)
     advantage, reward = jax.random.normal(key, (2, 24))
     log_prob = gaussian.log_prob(distribution, action)
-    return Batch(obs, action, log_prob, advantage, advantage, advantage[:, None], reward, jnp.full(24, 0.9), next_obs, jnp.ones(24, bool))
+    return Batch(
+        obs,
+        action,
+        log_prob,
+        advantage,
+        advantage,
+        advantage[:, None],
+        reward,
+        jnp.full(24, 0.9),
+        next_obs,
+        jnp.ones(24, bool),
+    )
 
 
 @pytest.mark.parametrize("clip", [0.2, jnp.inf])
-def test_at_the_acting_policy_the_surrogates_gradient_is_the_policy_gradient(clip, policy, params, batch):
+def test_at_the_acting_policy_the_surrogates_gradient_is_the_policy_gradient(
+    clip, policy, params, batch
+):
     def policy_gradient(p):
-        return -(gaussian.log_prob(policy.apply(p, batch.obs), batch.action) * batch.advantage).mean()
+        return -(
+            gaussian.log_prob(policy.apply(p, batch.obs), batch.action) * batch.advantage
+        ).mean()
 
     got = jax.grad(surrogate(policy, clip), has_aux=True)(params, batch)[0]
     assert distance(got, jax.grad(policy_gradient)(params)) < 1e-6
@@ -50,7 +65,9 @@ def test_at_the_acting_policy_the_ratio_is_exactly_one(policy, params, batch):
     assert info["kl"] == 0
 
 
-def test_the_clip_stops_gradient_where_the_ratio_has_moved_with_the_advantage(policy, params, batch):
+def test_the_clip_stops_gradient_where_the_ratio_has_moved_with_the_advantage(
+    policy, params, batch
+):
     # every ratio is e > 1.2: with positive advantages all gradient is gone, with negative ones none is
     moved = batch._replace(log_prob=batch.log_prob - 1)
     up, down = (moved._replace(advantage=jnp.full(24, a)) for a in (1.0, -1.0))
@@ -63,9 +80,15 @@ def test_the_clip_stops_gradient_where_the_ratio_has_moved_with_the_advantage(po
 
 @pytest.mark.parametrize("clip", [0.2, jnp.inf])
 @pytest.mark.parametrize("log_ratio", [200.0, -200.0])
-def test_a_ratio_that_overflows_is_bounded_and_leaves_the_gradient_of_the_others(clip, log_ratio, policy, params, batch):
-    wild = batch._replace(log_prob=batch.log_prob.at[5].add(-log_ratio), advantage=batch.advantage.at[5].set(-1.0))
-    without = batch._replace(valid=batch.valid.at[5].set(False), advantage=batch.advantage.at[5].set(0))
+def test_a_ratio_that_overflows_is_bounded_and_leaves_the_gradient_of_the_others(
+    clip, log_ratio, policy, params, batch
+):
+    wild = batch._replace(
+        log_prob=batch.log_prob.at[5].add(-log_ratio), advantage=batch.advantage.at[5].set(-1.0)
+    )
+    without = batch._replace(
+        valid=batch.valid.at[5].set(False), advantage=batch.advantage.at[5].set(0)
+    )
     (value, info), got = jax.value_and_grad(surrogate(policy, clip), has_aux=True)(params, wild)
     assert all(jnp.isfinite(x) for x in (value, *info.values()))
     assert distance(got, jax.grad(surrogate(policy, clip), has_aux=True)(params, without)[0]) < 1e-6
@@ -75,21 +98,33 @@ def test_the_bound_of_the_ratio_is_exact_below_e_to_the_twentieth(policy, params
     moved = batch._replace(log_prob=batch.log_prob + jnp.linspace(-19.9, 19.9, 24))
 
     def unbounded(p):
-        return -(jnp.exp(gaussian.log_prob(policy.apply(p, moved.obs), moved.action) - moved.log_prob) * moved.advantage).mean()
+        return -(
+            jnp.exp(gaussian.log_prob(policy.apply(p, moved.obs), moved.action) - moved.log_prob)
+            * moved.advantage
+        ).mean()
 
-    got, want = jax.grad(surrogate(policy), has_aux=True)(params, moved)[0], jax.grad(unbounded)(params)
+    got, want = (
+        jax.grad(surrogate(policy), has_aux=True)(params, moved)[0],
+        jax.grad(unbounded)(params),
+    )
     for a, b in zip(jax.tree.leaves(got), jax.tree.leaves(want), strict=True):
         assert_allclose(a, b, rtol=1e-5)
 
 
-def test_one_epoch_of_one_minibatch_is_one_optimizer_step_on_the_whole_batch_whatever_the_clip(policy, params, batch, key):
+def test_one_epoch_of_one_minibatch_is_one_optimizer_step_on_the_whole_batch_whatever_the_clip(
+    policy, params, batch, key
+):
     optimizer = optax.adam(1e-2)
     results = [
-        sgd(surrogate(policy, clip), optimizer, epochs=1, minibatches=1).step(key, Fit(params, optimizer.init(params)), batch)[0]
+        sgd(surrogate(policy, clip), optimizer, epochs=1, minibatches=1).step(
+            key, TrainableState(params, optimizer.init(params)), batch
+        )[0]
         for clip in (0.2, jnp.inf)
     ]
     gradient = jax.grad(surrogate(policy), has_aux=True)(params, batch)[0]
-    want = optax.apply_updates(params, optimizer.update(gradient, optimizer.init(params), params)[0])
+    want = optax.apply_updates(
+        params, optimizer.update(gradient, optimizer.init(params), params)[0]
+    )
     assert distance(results[0].params, results[1].params) == 0
     assert distance(results[0].params, want) < 1e-6
 
@@ -101,7 +136,7 @@ def test_an_epoch_visits_every_sample_once(batch, key):
     optimizer = optax.sgd(1.0)
     for epochs, minibatches in ((1, 4), (3, 8)):
         fit, info = sgd(loss, optimizer, epochs=epochs, minibatches=minibatches).step(
-            key, Fit(jnp.zeros(()), optimizer.init(jnp.zeros(()))), batch
+            key, TrainableState(jnp.zeros(()), optimizer.init(jnp.zeros(()))), batch
         )
         assert_allclose(fit.params, -24.0 * epochs)  # each sample's gradient is 1
         assert_allclose(info["gradient_norm"], 24 / minibatches)
@@ -110,7 +145,9 @@ def test_an_epoch_visits_every_sample_once(batch, key):
 def test_a_batch_that_does_not_divide_is_refused(policy, params, batch, key):
     optimizer = optax.sgd(1.0)
     with pytest.raises(ValueError, match="does not divide into 7"):
-        sgd(surrogate(policy), optimizer, epochs=1, minibatches=7).step(key, Fit(params, optimizer.init(params)), batch)
+        sgd(surrogate(policy), optimizer, epochs=1, minibatches=7).step(
+            key, TrainableState(params, optimizer.init(params)), batch
+        )
 
 
 def test_the_learning_rate_falls_linearly_to_its_last_fraction():
@@ -152,7 +189,11 @@ def test_an_invalid_sample_weighs_nothing_in_policy_and_critic(policy, params, b
         target=batch.target.at[5].set(1e9),
     )
     without = jax.tree.map(lambda x: jnp.delete(x, 5, axis=0), batch)
-    for loss, at in ((surrogate(policy, 0.2), params), (surrogate(policy), params), (critic.loss, values)):
+    for loss, at in (
+        (surrogate(policy, 0.2), params),
+        (surrogate(policy), params),
+        (critic.loss, values),
+    ):
         got, want = (jax.grad(loss, has_aux=True)(at, b)[0] for b in (broken, without))
         assert distance(jax.tree.map(lambda g: g * 24 / 23, got), want) < 1e-5
     assert surrogate(policy)(params, broken)[1]["kl"] == 0
@@ -169,7 +210,17 @@ def test_every_critic_takes_every_target(kind, target, key):
     assert got.shape == (6, 5, 1 if target == "lambda-return" else z.shape[-1])
     empty = jnp.zeros(30)
     seen, then, fit = obs.reshape(30, 3), next_obs.reshape(30, 3), got.reshape(30, -1)
-    columns = seen, empty[:, None], empty, empty, z.mean(-1).ravel(), fit, reward.ravel(), factor.ravel(), then
+    columns = (
+        seen,
+        empty[:, None],
+        empty,
+        empty,
+        z.mean(-1).ravel(),
+        fit,
+        reward.ravel(),
+        factor.ravel(),
+        then,
+    )
     flat = Batch(*columns, valid=jnp.ones(30, bool))
     gradient = jax.grad(critic.loss, has_aux=True)(params, flat)[0]
     assert 0 < float(optax.global_norm(gradient)) < 1e3
@@ -187,14 +238,22 @@ def test_the_bellman_target_follows_the_critic_and_the_frozen_one_does_not(batch
 def test_no_gradient_flows_through_the_bellman_target(batch, key):
     critic = critic_of("scalar", "bellman")
     params = critic.init(key)
-    target = batch.reward[:, None] + batch.discount[:, None] * critic.predict(params, batch.next_obs)
+    target = batch.reward[:, None] + batch.discount[:, None] * critic.predict(
+        params, batch.next_obs
+    )
     want = jax.grad(lambda p: (0.5 * (critic.predict(p, batch.obs) - target) ** 2).mean())(params)
     assert distance(jax.grad(critic.loss, has_aux=True)(params, batch)[0], want) < 1e-6
 
 
-def test_ordered_quantiles_are_fitted_in_the_mean_as_a_scalar_and_in_shape_by_the_crps_about_the_mean_before(batch, key):
+def test_ordered_quantiles_are_fitted_in_the_mean_as_a_scalar_and_in_shape_by_the_crps_about_the_mean_before(
+    batch, key
+):
     critic = critics.ordered(3, hidden=(), target=critics.BELLMAN_FROZEN, quantiles=8, kappa=1e-5)
-    params, target, before = critic.init(key), jax.random.normal(key, (24, 5)), jnp.linspace(-1, 1, 24)
+    params, target, before = (
+        critic.init(key),
+        jax.random.normal(key, (24, 5)),
+        jnp.linspace(-1, 1, 24),
+    )
     at = batch._replace(obs=jnp.zeros((24, 3)), target=target, value=before)
 
     def by_output(loss):
@@ -216,12 +275,15 @@ def test_ordered_quantiles_are_fitted_in_the_mean_as_a_scalar_and_in_shape_by_th
 
 def test_a_sorted_critic_is_fitted_as_a_quantile_critic_and_predicts_the_same_in_order(batch, key):
     settings = {"hidden": (4,), "target": critics.BELLMAN, "quantiles": 8, "kappa": 1.0}
-    plain, in_order = critics.quantile(3, **settings), critics.sorted_quantile(3, **settings)
+    plain, monotone_quantiles = (
+        critics.quantile(3, **settings),
+        critics.sorted_quantile(3, **settings),
+    )
     params = plain.init(key)
     predicted = plain.predict(params, batch.obs)
     assert (jnp.diff(predicted) < 0).any()
-    assert_array_equal(in_order.predict(params, batch.obs), jnp.sort(predicted))
-    assert in_order.loss(params, batch)[0] == plain.loss(params, batch)[0]
+    assert_array_equal(monotone_quantiles.predict(params, batch.obs), jnp.sort(predicted))
+    assert monotone_quantiles.loss(params, batch)[0] == plain.loss(params, batch)[0]
 
 
 # ---- policy networks ----
@@ -245,7 +307,9 @@ def test_the_shared_covariance_is_the_same_everywhere_and_the_states_is_not(key)
 
 
 def test_hidden_weights_are_orthogonal(key):
-    params = gaussian_policy(8, 2, hidden=(8,), covariance=SharedCovariance, initial_std=1.0).init(key)
+    params = gaussian_policy(8, 2, hidden=(8,), covariance=SharedCovariance, initial_std=1.0).init(
+        key
+    )
     weight = params["params"]["Torso_0"]["Dense_0"]["kernel"]
     assert_allclose(weight @ weight.T, 2 * jnp.eye(8), atol=1e-5)
     assert_array_equal(params["params"]["Torso_0"]["Dense_0"]["bias"], 0)

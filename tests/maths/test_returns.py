@@ -18,7 +18,9 @@ def trajectory(key, steps=12, worlds=3, k=4, ends=True):
     truncated = jax.random.bernoulli(keys[1], 0.2 * ends, (steps, worlds)) & ~terminated
     reward = jax.random.normal(keys[2], (steps, worlds))
     z = jax.random.normal(keys[3], (steps + 1, worlds, k))
-    elsewhere = jax.random.normal(keys[4], (steps, worlds, k))  # the successor of an episode's last step is not the next row
+    elsewhere = jax.random.normal(
+        keys[4], (steps, worlds, k)
+    )  # the successor of an episode's last step is not the next row
     z_next = jnp.where((terminated | truncated)[..., None], elsewhere, z[1:])
     return reward, z[:-1], z_next, terminated, truncated
 
@@ -26,15 +28,31 @@ def trajectory(key, steps=12, worlds=3, k=4, ends=True):
 def test_gae_of_three_steps_by_hand():
     # γ = λ = ½; δ = 1 + ½·1 - ½ = 1, 2 + ½·1.5 - 1 = 1.75, last: 3 - 1.5 = 1.5 where it terminates
     # A₂ = 1.5, A₁ = 1.75 + ¼·1.5 = 2.125, A₀ = 1 + ¼·2.125 = 1.53125
-    reward, value, next_value = jnp.array([1.0, 2.0, 3.0]), jnp.array([0.5, 1.0, 1.5]), jnp.array([1.0, 1.5, 2.0])
-    no, last, middle = jnp.zeros(3, bool), jnp.array([False, False, True]), jnp.array([False, True, False])
-    assert_allclose(dg.gae(reward, value, next_value, last, no, gamma=0.5, lam=0.5), [1.53125, 2.125, 1.5])
+    reward, value, next_value = (
+        jnp.array([1.0, 2.0, 3.0]),
+        jnp.array([0.5, 1.0, 1.5]),
+        jnp.array([1.0, 1.5, 2.0]),
+    )
+    no, last, middle = (
+        jnp.zeros(3, bool),
+        jnp.array([False, False, True]),
+        jnp.array([False, True, False]),
+    )
+    assert_allclose(
+        dg.gae(reward, value, next_value, last, no, gamma=0.5, lam=0.5), [1.53125, 2.125, 1.5]
+    )
     # truncated instead: the last step bootstraps, δ₂ = 3 + ½·2 - 1.5 = 2.5
-    assert_allclose(dg.gae(reward, value, next_value, no, last, gamma=0.5, lam=0.5), [1.59375, 2.375, 2.5])
+    assert_allclose(
+        dg.gae(reward, value, next_value, no, last, gamma=0.5, lam=0.5), [1.59375, 2.375, 2.5]
+    )
     # truncated in the middle: δ₁ keeps its bootstrap and the trace stops there
-    assert_allclose(dg.gae(reward, value, next_value, no, middle, gamma=0.5, lam=0.5), [1.4375, 1.75, 2.5])
+    assert_allclose(
+        dg.gae(reward, value, next_value, no, middle, gamma=0.5, lam=0.5), [1.4375, 1.75, 2.5]
+    )
     # terminated in the middle: δ₁ = 2 - 1 = 1
-    assert_allclose(dg.gae(reward, value, next_value, middle, no, gamma=0.5, lam=0.5), [1.25, 1.0, 2.5])
+    assert_allclose(
+        dg.gae(reward, value, next_value, middle, no, gamma=0.5, lam=0.5), [1.25, 1.0, 2.5]
+    )
 
 
 def test_dgae_with_the_identity_metric_is_gae_on_the_means_of_the_quantiles(key):
@@ -67,7 +85,9 @@ def test_scan_agrees_with_a_plain_loop(key):
 @pytest.mark.parametrize("n", [1, 2, 5])
 def test_n_step_estimator_telescopes_into_discounted_residuals(n, weights, key):
     reward, z, z_next, terminated, truncated = trajectory(key, ends=False)
-    got = dg.n_step_advantage(reward, z, z_next, terminated, truncated, gamma=GAMMA, n=n, weights=weights)
+    got = dg.n_step_advantage(
+        reward, z, z_next, terminated, truncated, gamma=GAMMA, n=n, weights=weights
+    )
     delta = dg.distributional_td_residual(reward, jnp.full_like(reward, GAMMA), z, z_next, weights)
     for t in range(12):
         want = sum(GAMMA**k * delta[t + k] for k in range(min(n, 12 - t)))
@@ -96,9 +116,13 @@ def test_lambda_zero_is_the_residual_and_lambda_one_the_longest_estimator(weight
 def test_estimators_take_any_batch_axes(key):
     reward, z, z_next, terminated, truncated = trajectory(key)
     flat = dg.dgae(reward, z, z_next, terminated, truncated, gamma=GAMMA, lam=LAM)
-    single = dg.dgae(reward[:, 0], z[:, 0], z_next[:, 0], terminated[:, 0], truncated[:, 0], gamma=GAMMA, lam=LAM)
+    single = dg.dgae(
+        reward[:, 0], z[:, 0], z_next[:, 0], terminated[:, 0], truncated[:, 0], gamma=GAMMA, lam=LAM
+    )
     assert_allclose(single, flat[:, 0], rtol=1e-6)
-    mapped = jax.vmap(lambda *a: dg.dgae(*a, gamma=GAMMA, lam=LAM), 1, 1)(reward, z, z_next, terminated, truncated)
+    mapped = jax.vmap(lambda *a: dg.dgae(*a, gamma=GAMMA, lam=LAM), 1, 1)(
+        reward, z, z_next, terminated, truncated
+    )
     assert_allclose(mapped, flat, rtol=1e-6)
 
 
@@ -118,14 +142,20 @@ def test_an_n_step_estimator_of_no_steps_is_refused(key):
 
 
 def test_bellman_target_shifts_and_scales_each_atom_and_ends_at_the_reward():
-    reward, discount, z_next = jnp.array([1.0, 2.0]), jnp.array([0.5, 0.0]), jnp.array([[2.0, 4.0], [6.0, 8.0]])
+    reward, discount, z_next = (
+        jnp.array([1.0, 2.0]),
+        jnp.array([0.5, 0.0]),
+        jnp.array([[2.0, 4.0], [6.0, 8.0]]),
+    )
     assert_allclose(dg.bellman_target(reward, discount, z_next), [[2.0, 3.0], [2.0, 2.0]])
 
 
 def test_lambda_return_is_value_plus_gae(key):
     reward, z, z_next, terminated, truncated = trajectory(key)
     d = decay(terminated, truncated, gamma=GAMMA, lam=LAM)
-    advantage = dg.gae(reward, z.mean(-1), z_next.mean(-1), terminated, truncated, gamma=GAMMA, lam=LAM)
+    advantage = dg.gae(
+        reward, z.mean(-1), z_next.mean(-1), terminated, truncated, gamma=GAMMA, lam=LAM
+    )
     got = dg.lambda_return(reward, *d, z, z_next)
     assert got.shape == (12, 3)
     assert_allclose(got, z.mean(-1) + advantage, atol=1e-6)
@@ -134,15 +164,24 @@ def test_lambda_return_is_value_plus_gae(key):
 def test_lambda_shift_has_the_lambda_returns_mean_and_the_one_step_targets_shape(key):
     reward, z, z_next, terminated, truncated = trajectory(key)
     d = decay(terminated, truncated, gamma=GAMMA, lam=LAM)
-    got, one_step = dg.lambda_shift_target(reward, *d, z, z_next), dg.bellman_target(reward, d.discount, z_next)
+    got, one_step = (
+        dg.lambda_shift_target(reward, *d, z, z_next),
+        dg.bellman_target(reward, d.discount, z_next),
+    )
     assert_allclose(got.mean(-1), dg.lambda_return(reward, *d, z, z_next), atol=1e-5)
-    assert_allclose(got - got.mean(-1, keepdims=True), one_step - one_step.mean(-1, keepdims=True), atol=1e-5)
+    assert_allclose(
+        got - got.mean(-1, keepdims=True), one_step - one_step.mean(-1, keepdims=True), atol=1e-5
+    )
 
 
 def test_sample_replacement_with_lambda_zero_is_the_bellman_target(key):
     reward, _, z_next, terminated, truncated = trajectory(key)
     d = decay(terminated, truncated, gamma=GAMMA, lam=0.0)
-    assert_allclose(dg.sr_lambda_target(key, reward, *d, z_next), dg.bellman_target(reward, d.discount, z_next), atol=1e-6)
+    assert_allclose(
+        dg.sr_lambda_target(key, reward, *d, z_next),
+        dg.bellman_target(reward, d.discount, z_next),
+        atol=1e-6,
+    )
 
 
 def test_sample_replacement_with_lambda_one_is_the_return_to_the_end_of_the_trace(key):
@@ -151,14 +190,18 @@ def test_sample_replacement_with_lambda_one_is_the_return_to_the_end_of_the_trac
     got, later = dg.sr_lambda_target(key, reward, *d, z_next), np.asarray(z_next[-1])
     for t in reversed(range(12)):
         done = np.asarray(terminated | truncated)[t][:, None]
-        later = np.asarray(reward[t])[:, None] + np.asarray(d.discount[t])[:, None] * np.where(done, z_next[t], later)
+        later = np.asarray(reward[t])[:, None] + np.asarray(d.discount[t])[:, None] * np.where(
+            done, z_next[t], later
+        )
         assert_allclose(got[t], later, atol=1e-5)
 
 
 def test_sample_replacement_has_the_lambda_returns_mean_over_its_coin_flips(key):
     reward, z, z_next, terminated, truncated = trajectory(key)
     d = decay(terminated, truncated, gamma=GAMMA, lam=LAM)
-    draws = jax.vmap(lambda k: dg.sr_lambda_target(k, reward, *d, z_next).mean(-1))(jax.random.split(key, 4_000))
+    draws = jax.vmap(lambda k: dg.sr_lambda_target(k, reward, *d, z_next).mean(-1))(
+        jax.random.split(key, 4_000)
+    )
     error = draws.mean(0) - dg.lambda_return(reward, *d, z, z_next)
     assert jnp.all(jnp.abs(error) < 5 * draws.std(0) / 4_000**0.5 + 1e-5)
 
@@ -166,4 +209,8 @@ def test_sample_replacement_has_the_lambda_returns_mean_over_its_coin_flips(key)
 def test_for_one_quantile_the_shifted_target_is_the_lambda_return(key):
     reward, z, z_next, terminated, truncated = trajectory(key, k=1)
     d = decay(terminated, truncated, gamma=GAMMA, lam=LAM)
-    assert_allclose(dg.lambda_shift_target(reward, *d, z, z_next)[..., 0], dg.lambda_return(reward, *d, z, z_next), atol=1e-6)
+    assert_allclose(
+        dg.lambda_shift_target(reward, *d, z, z_next)[..., 0],
+        dg.lambda_return(reward, *d, z, z_next),
+        atol=1e-6,
+    )

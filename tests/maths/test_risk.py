@@ -9,7 +9,15 @@ from dgae_jax.maths.returns import decay, distributional_td_residual, lambda_sum
 from dgae_jax.maths.risk import METRICS, weights_of
 from dgae_jax.maths.transport import directional_metric
 
-SPECS = ["mean-cvar:0.25:0.5", "cvar:0.25", "cvar:1", "wang:0.75", "wang:-0.5", "power:2", "power:0.5"]
+SPECS = [
+    "mean-cvar:0.25:0.5",
+    "cvar:0.25",
+    "cvar:1",
+    "wang:0.75",
+    "wang:-0.5",
+    "power:2",
+    "power:0.5",
+]
 
 
 @pytest.mark.parametrize("spec", SPECS)
@@ -22,7 +30,9 @@ def test_weights_are_non_negative_and_of_mean_one_for_any_number_of_quantiles(sp
 
 def test_cvar_of_a_quarter_weighs_the_lowest_quarter_by_four():
     assert_allclose(weights_of("cvar:0.25", 8), [4, 4, 0, 0, 0, 0, 0, 0], atol=1e-6)
-    assert_allclose(weights_of("cvar:0.3", 4), [1 / 0.3, 4 * 0.05 / 0.3, 0, 0], rtol=1e-5)  # a cell is cut in proportion
+    assert_allclose(
+        weights_of("cvar:0.3", 4), [1 / 0.3, 4 * 0.05 / 0.3, 0, 0], rtol=1e-5
+    )  # a cell is cut in proportion
 
 
 def test_power_two_is_the_expected_minimum_of_two_draws():
@@ -43,18 +53,36 @@ def test_neutral_parameters_are_the_mean_and_the_mean_needs_no_weights():
 
 
 @pytest.mark.parametrize(
-    "spec", ["cvar", "cvar:0", "cvar:1.5", "cvar:x", "wang:inf", "power:0", "power:-1", "mean:1", "mean-cvar:0.1:2", "median"]
+    "spec",
+    [
+        "cvar",
+        "cvar:0",
+        "cvar:1.5",
+        "cvar:x",
+        "wang:inf",
+        "power:0",
+        "power:-1",
+        "mean:1",
+        "mean-cvar:0.1:2",
+        "median",
+    ],
 )
 def test_other_metrics_are_refused_with_what_is_allowed(spec):
-    with pytest.raises(ValueError, match="cvar" if spec in ("cvar", "mean:1", "median") else spec.split(":")[0]):
+    with pytest.raises(
+        ValueError, match="cvar" if spec in ("cvar", "mean:1", "median") else spec.split(":")[0]
+    ):
         weights_of(spec, 8)
 
 
 def test_a_users_weights_join_the_table_and_must_integrate_to_one(monkeypatch):
     neutral = METRICS["mean"]
-    monkeypatch.setitem(METRICS, "median", neutral._replace(weights=lambda k: jnp.zeros(k).at[k // 2].set(k)))
+    monkeypatch.setitem(
+        METRICS, "median", neutral._replace(weights=lambda k: jnp.zeros(k).at[k // 2].set(k))
+    )
     monkeypatch.setitem(METRICS, "double", neutral._replace(weights=lambda k: 2 * jnp.ones(k)))
-    assert_allclose(directional_metric(jnp.array([1.0, 5.0, 9.0]), jnp.zeros(3), weights_of("median", 3)), 5)
+    assert_allclose(
+        directional_metric(jnp.array([1.0, 5.0, 9.0]), jnp.zeros(3), weights_of("median", 3)), 5
+    )
     with pytest.raises(ValueError, match="mean 1"):
         weights_of("double", 3)
 
@@ -63,7 +91,9 @@ def test_a_users_weights_join_the_table_and_must_integrate_to_one(monkeypatch):
 def test_residuals_telescope_under_every_metric(spec, key):
     # Σ γᵏ δₜ₊ₖ over n steps is the n-step advantage, because the metric is translation and scale equivariant
     reward, (z, z_next) = jax.random.normal(key, (6, 2)), jax.random.normal(key, (2, 6, 2, 8))
-    z_next = jnp.concatenate([z[1:], z_next[-1:]])  # one critic: the successor's prediction is the next state's
+    z_next = jnp.concatenate(
+        [z[1:], z_next[-1:]]
+    )  # one critic: the successor's prediction is the next state's
     off, weights = jnp.zeros((6, 2), bool), weights_of(spec, 8)
     discount, trace = decay(off, off, gamma=0.9, lam=1.0)
     delta = distributional_td_residual(reward, discount, z, z_next, weights)
@@ -74,12 +104,22 @@ def test_residuals_telescope_under_every_metric(spec, key):
 def test_with_a_preference_the_residual_of_a_perfect_critic_is_not_zero_and_at_lambda_one_risk_cancels():
     # a coin pays 0 or 10: a perfect critic knows {0, 10} before and the payment after; a sure 5 is the alternative
     weights, before, nothing = weights_of("cvar:0.5", 2), jnp.array([0.0, 10.0]), jnp.zeros(2)
-    residuals = jnp.array([distributional_td_residual(jnp.float32(r), jnp.float32(1), before, nothing, weights) for r in (0.0, 10.0)])
-    assert_allclose(residuals, [0, 10])  # the value by CVaR is 0, so that even the worse half is no disappointment
+    residuals = jnp.array(
+        [
+            distributional_td_residual(jnp.float32(r), jnp.float32(1), before, nothing, weights)
+            for r in (0.0, 10.0)
+        ]
+    )
+    assert_allclose(
+        residuals, [0, 10]
+    )  # the value by CVaR is 0, so that even the worse half is no disappointment
     assert residuals.mean() == 5  # E[δ] ≠ 0 although the critic is perfect
     # with λ = 1 the advantage is (sum of rewards) − ρ(before): gambling or the sure 5, from the same state, differ by their means alone
     sure = distributional_td_residual(jnp.float32(5), jnp.float32(1), before, nothing, weights)
     assert_allclose(residuals.mean() - sure, 0, atol=1e-6)
     # with λ = 0 the step before the coin sees its CVaR: entering the gamble is 5 worse than entering the sure payment
-    enter = [distributional_td_residual(jnp.float32(0), jnp.float32(1), before, z, weights) for z in (before, jnp.array([5.0, 5.0]))]
+    enter = [
+        distributional_td_residual(jnp.float32(0), jnp.float32(1), before, z, weights)
+        for z in (before, jnp.array([5.0, 5.0]))
+    ]
     assert_allclose(enter[0] - enter[1], -5)

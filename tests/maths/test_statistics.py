@@ -11,13 +11,17 @@ import dgae_jax as dg
 def test_explained_variance_is_one_for_the_truth_and_zero_for_a_constant():
     y = jnp.array([1.0, 2.0, 4.0])
     assert_allclose(dg.explained_variance(y, y), 1.0)
-    assert_allclose(dg.explained_variance(y + 3, y), 1.0, atol=1e-6)  # variance does not see a constant offset
+    assert_allclose(
+        dg.explained_variance(y + 3, y), 1.0, atol=1e-6
+    )  # variance does not see a constant offset
     assert_allclose(dg.explained_variance(jnp.full(3, 7.0), y), 0.0, atol=1e-6)
     assert jnp.isnan(dg.explained_variance(y, jnp.ones(3)))
 
 
 def test_pit_counts_quantiles_at_or_below_the_outcome():
-    assert_allclose(dg.pit(jnp.array([[1.0, 2.0, 3.0, 4.0]] * 3), jnp.array([0.0, 2.0, 9.0])), [0.0, 0.5, 1.0])
+    assert_allclose(
+        dg.pit(jnp.array([[1.0, 2.0, 3.0, 4.0]] * 3), jnp.array([0.0, 2.0, 9.0])), [0.0, 0.5, 1.0]
+    )
 
 
 def test_a_true_distribution_has_uniform_pit_and_nominal_coverage(key):
@@ -26,7 +30,9 @@ def test_a_true_distribution_has_uniform_pit_and_nominal_coverage(key):
     z = jnp.broadcast_to(z, (20_000, 64))
     assert_allclose(np.histogram(dg.pit(z, y), 8, (0, 1))[0] / 20_000, 1 / 8, atol=0.02)
     assert_allclose(dg.coverage(z, y, 0.9), 0.9, atol=0.015)
-    assert_allclose(dg.coverage(0.5 * z, y, 0.9), 2 * scipy.stats.norm.cdf(0.5 * 1.6449) - 1, atol=0.015)
+    assert_allclose(
+        dg.coverage(0.5 * z, y, 0.9), 2 * scipy.stats.norm.cdf(0.5 * 1.6449) - 1, atol=0.015
+    )
 
 
 @pytest.mark.parametrize("k", [1, 2, 4, 9])
@@ -41,7 +47,9 @@ def test_fewer_than_ten_quantiles_say_nothing_of_the_central_ninety_percent(k):
 def test_exact_quantiles_have_nominal_coverage_up_to_the_outermost_of_them(of, k, level):
     y = jnp.asarray(of.ppf((np.arange(10_000) + 0.5) / 10_000), jnp.float32)
     z = jnp.asarray(of.ppf(np.asarray(dg.quantile_midpoints(k))), jnp.float32)
-    assert_allclose(dg.coverage(jnp.broadcast_to(z, (10_000, k)), y, level), level, atol=0.015)  # between midpoints a line
+    assert_allclose(
+        dg.coverage(jnp.broadcast_to(z, (10_000, k)), y, level), level, atol=0.015
+    )  # between midpoints a line
 
 
 def test_crps_does_not_depend_on_the_order_of_the_quantiles():
@@ -69,7 +77,9 @@ def test_interquartile_mean_agrees_with_scipy(n, key):
 def test_bootstrap_interval_of_a_mean_agrees_with_scipy(key):
     x = jax.random.normal(key, (40,))
     got = dg.bootstrap_interval(key, x, jnp.mean, resamples=20_000)
-    want = scipy.stats.bootstrap((np.asarray(x),), np.mean, method="percentile", n_resamples=20_000, rng=0).confidence_interval
+    want = scipy.stats.bootstrap(
+        (np.asarray(x),), np.mean, method="percentile", n_resamples=20_000, rng=0
+    ).confidence_interval
     assert_allclose(got, want, atol=0.02)
 
 

@@ -6,7 +6,7 @@ import scipy.stats
 from numpy.testing import assert_allclose
 
 import dgae_jax as dg
-from dgae_jax.maths.transport import huber, in_order
+from dgae_jax.maths.transport import huber, monotone_quantiles
 
 CVAR_HALF = jnp.array([2.0, 2.0, 0.0, 0.0])  # mean of the worse half
 
@@ -22,7 +22,9 @@ def test_fewer_than_one_quantile_is_refused():
 
 def test_directional_metric_is_the_difference_of_means_by_hand():
     # ((3 - 0) + (5 - 1) + (1 - 2)) / 3 = 6 / 3
-    assert_allclose(dg.directional_metric(jnp.array([3.0, 5.0, 1.0]), jnp.array([0.0, 1.0, 2.0])), 2.0)
+    assert_allclose(
+        dg.directional_metric(jnp.array([3.0, 5.0, 1.0]), jnp.array([0.0, 1.0, 2.0])), 2.0
+    )
 
 
 def test_spectral_metric_weighs_sorted_quantiles_by_hand():
@@ -55,7 +57,14 @@ def test_similar_means_and_different_shapes_are_near_in_the_metric_and_far_in_wa
 
 
 @pytest.mark.parametrize(
-    "weights", [jnp.array([1.0, 2.0]), jnp.array([3.0, -1.0]), jnp.ones((2, 2)), jnp.array([jnp.nan, 1.0]), jnp.array([0.0, 1.0])]
+    "weights",
+    [
+        jnp.array([1.0, 2.0]),
+        jnp.array([3.0, -1.0]),
+        jnp.ones((2, 2)),
+        jnp.array([jnp.nan, 1.0]),
+        jnp.array([0.0, 1.0]),
+    ],
 )
 def test_weights_that_are_negative_or_do_not_integrate_to_one_are_refused(weights):
     with pytest.raises(ValueError, match="of mean 1"):
@@ -70,13 +79,20 @@ def test_weights_may_be_traced():
 def test_a_negative_factor_does_not_scale_a_preference_because_it_reverses_the_order_of_the_quantiles():
     # u = 0 1 2 5 and CVaR at ½: ρ(u) = (0 + 1)/2 = ½, ρ(−u) = (−5 − 2)/2 = −3.5 ≠ −½; a positive factor scales it: ρ(2u) = 1
     u, zero = jnp.array([5.0, 0.0, 2.0, 1.0]), jnp.zeros(4)
-    assert_allclose([dg.directional_metric(f * u, zero, CVAR_HALF) for f in (1.0, 2.0, 0.0, -1.0)], [0.5, 1.0, 0.0, -3.5])
+    assert_allclose(
+        [dg.directional_metric(f * u, zero, CVAR_HALF) for f in (1.0, 2.0, 0.0, -1.0)],
+        [0.5, 1.0, 0.0, -3.5],
+    )
 
 
 @pytest.mark.parametrize("p", [1.0, 2.0])
 def test_wasserstein_agrees_with_scipy(p, key):
     u, v = np.asarray(jax.random.normal(key, (2, 11)))
-    order = scipy.stats.wasserstein_distance(u, v) if p == 1 else np.mean((np.sort(u) - np.sort(v)) ** 2) ** 0.5
+    order = (
+        scipy.stats.wasserstein_distance(u, v)
+        if p == 1
+        else np.mean((np.sort(u) - np.sort(v)) ** 2) ** 0.5
+    )
     assert_allclose(dg.wasserstein(jnp.asarray(u), jnp.asarray(v), p), order, rtol=1e-5)
 
 
@@ -89,13 +105,13 @@ def test_quantiles_in_order_by_hand():
     # steps of log(1 + e^0) = log 2 and log(1 + e^log 3) = log 4 about the mean 1: they start at 1 - (2 log 2 + log 4) / 3
     first = 1 - 4 * np.log(2) / 3
     want = [first, first + np.log(2), first + 3 * np.log(2)]
-    assert_allclose(in_order(jnp.array([1.0, 5.0, 5.0 + np.log(3)])), want, rtol=1e-6)
+    assert_allclose(monotone_quantiles(jnp.array([1.0, 5.0, 5.0 + np.log(3)])), want, rtol=1e-6)
 
 
 @pytest.mark.parametrize("k", [1, 2, 64])
 def test_quantiles_in_order_do_not_cross_and_have_the_mean_that_they_are_given(k, key):
     outputs = 10 * jax.random.normal(key, (100, k))
-    z = in_order(outputs)
+    z = monotone_quantiles(outputs)
     assert z.shape == (100, k)
     assert float(jnp.diff(z).min(initial=1)) > -1e-5
     assert_allclose(z.mean(-1), outputs[:, 0], atol=1e-4)
@@ -137,21 +153,31 @@ def test_quantile_huber_and_its_derivatives_are_those_of_all_residuals_laid_out(
     loss = jax.jit(lambda z, y: dg.quantile_huber_loss(z, y, kappa=0.7))
     value, by_quantiles, by_target = laid_out(z, y, 0.7)
     assert_allclose(loss(z, y), value, rtol=1e-5)
-    assert_allclose(jax.grad(lambda z, y: loss(z, y).sum(), argnums=0)(z, y), by_quantiles, rtol=1e-5, atol=1e-6)
-    assert_allclose(jax.grad(lambda z, y: loss(z, y).sum(), argnums=1)(z, y), by_target, rtol=1e-5, atol=1e-6)
+    assert_allclose(
+        jax.grad(lambda z, y: loss(z, y).sum(), argnums=0)(z, y), by_quantiles, rtol=1e-5, atol=1e-6
+    )
+    assert_allclose(
+        jax.grad(lambda z, y: loss(z, y).sum(), argnums=1)(z, y), by_target, rtol=1e-5, atol=1e-6
+    )
 
 
 def test_quantile_huber_of_one_quantile_is_half_the_huber_loss(key):
     z, y = jax.random.normal(key, (2, 6, 1))
-    assert_allclose(dg.quantile_huber_loss(z, y, kappa=0.3), 0.5 * huber(y - z, 0.3)[0][:, 0], rtol=1e-6)
+    assert_allclose(
+        dg.quantile_huber_loss(z, y, kappa=0.3), 0.5 * huber(y - z, 0.3)[0][:, 0], rtol=1e-6
+    )
 
 
 @pytest.mark.parametrize("i", range(4))
 def test_quantile_huber_is_minimised_by_the_empirical_quantile(i, key):
     # 101·τᵢ is no whole number for K = 4, so the empirical quantile is one of the samples, and no sample does better
     samples = jax.random.normal(key, (101,))
-    losses = jax.vmap(lambda x: dg.quantile_huber_loss(jnp.zeros(4).at[i].set(x), samples, kappa=1e-3))(samples)
-    expected = np.quantile(np.asarray(samples), float(dg.quantile_midpoints(4)[i]), method="inverted_cdf")
+    losses = jax.vmap(
+        lambda x: dg.quantile_huber_loss(jnp.zeros(4).at[i].set(x), samples, kappa=1e-3)
+    )(samples)
+    expected = np.quantile(
+        np.asarray(samples), float(dg.quantile_midpoints(4)[i]), method="inverted_cdf"
+    )
     assert_allclose(samples[losses.argmin()], expected)
 
 
@@ -159,7 +185,9 @@ def test_quantile_huber_and_its_derivatives_on_an_accelerator_are_those_on_a_cpu
     quantiles, target = jnp.asarray(np.random.default_rng(0).normal(size=(2, 6, 5)), jnp.float32)
 
     def both():
-        return jax.value_and_grad(lambda q, t: dg.quantile_huber_loss(q, t, kappa=0.7).sum(), argnums=(0, 1))(quantiles, target)
+        return jax.value_and_grad(
+            lambda q, t: dg.quantile_huber_loss(q, t, kappa=0.7).sum(), argnums=(0, 1)
+        )(quantiles, target)
 
     got = both()
     with pytest.MonkeyPatch.context() as patch:

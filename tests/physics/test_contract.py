@@ -27,23 +27,35 @@ package = types.ModuleType("dgae_jax"); package.__path__ = ["dgae_jax"]; sys.mod
 import dgae_jax.physics.registry as physics, dgae_jax.envs.registry as envs
 envs.spec_of("brax:ant"), physics.ENGINES
 print(sorted({"jax", "mujoco", "brax", "flax", "gymnasium", "warp"} & set(sys.modules)))"""
-    assert subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True).stdout == "[]\n"
+    assert (
+        subprocess.run(
+            [sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True
+        ).stdout
+        == "[]\n"
+    )
 
 
 def test_an_unknown_engine_is_refused_with_what_exists():
-    with pytest.raises(ValueError, match="unknown physics 'bullet': must be one of jax, mjx, mjx-warp, native"):
+    with pytest.raises(
+        ValueError, match="unknown physics 'bullet': must be one of jax, mjx, mjx-warp, native"
+    ):
         make_physics("bullet", load_spec("hopper.xml"), 4, Reads())
 
 
 def test_an_engine_that_is_not_installed_is_refused_with_the_way_to_install_it(monkeypatch):
     monkeypatch.setattr(registry, "find_spec", lambda name: None)
     registry.require("mjx")
-    with pytest.raises(ValueError, match=r'mjx-warp needs the package warp.*pip install "dgae_jax\[warp\]"'):
+    with pytest.raises(
+        ValueError, match=r'mjx-warp needs the package warp.*pip install "dgae_jax\[warp\]"'
+    ):
         registry.require("mjx-warp")
 
 
 @pytest.mark.parametrize("engine", ALL)
-@pytest.mark.parametrize(("body", "reason"), [("tail", "no body 'tail'"), ("front_left_leg", "'front_left_leg' cannot be read")])
+@pytest.mark.parametrize(
+    ("body", "reason"),
+    [("tail", "no body 'tail'"), ("front_left_leg", "'front_left_leg' cannot be read")],
+)
 def test_a_body_that_an_engine_cannot_return_is_refused_by_name(engine, body, reason):
     with pytest.raises(ValueError, match=reason):
         make_physics(engine, load_spec("ant.xml"), 5, Reads(bodies=(body,)))
@@ -59,7 +71,9 @@ def test_a_reset_puts_floating_bodies_where_their_joints_say():
     xml = """<mujoco><worldbody><body name='a' pos='1 1 1'><freejoint/><geom size='.1'/></body>
       <body name='b'><freejoint/><geom size='.1'/></body></worldbody></mujoco>"""
     model, reads = mujoco.MjModel.from_xml_string(xml), Reads(("b", "a"), forces=True)
-    state = Physics(model, lambda state, ctrl: state, "none", reads).at_pose(jnp.arange(28.0).reshape(2, 14), jnp.zeros((2, 12)))
+    state = Physics(model, lambda state, ctrl: state, "none", reads).at_pose(
+        jnp.arange(28.0).reshape(2, 14), jnp.zeros((2, 12))
+    )
     assert_array_equal(body_ids(model, reads), [2, 1])
     assert_array_equal(state.xpos, [[[7, 8, 9], [0, 1, 2]], [[21, 22, 23], [14, 15, 16]]])
     assert state.cfrc_ext.shape == (2, 3, 6)

@@ -23,7 +23,11 @@ SPRINGY = """
 
 
 def model_of(name):
-    return mujoco.MjModel.from_xml_string(SPRINGY) if name == "springy" else load_spec(GYM_TASKS[name].FILE["v4"]).compile()
+    return (
+        mujoco.MjModel.from_xml_string(SPRINGY)
+        if name == "springy"
+        else load_spec(GYM_TASKS[name].FILE["v4"]).compile()
+    )
 
 
 @functools.cache
@@ -70,7 +74,9 @@ def test_constraint_rows_are_mujocos(name):
         scene = scene_of(tree)
 
         def rows(qpos, qvel, ctrl):
-            return contacts.constrain(scene, tree, dynamics.smooth(tree, qpos, qvel, ctrl), qpos, qvel)[0]
+            return contacts.constrain(
+                scene, tree, dynamics.smooth(tree, qpos, qvel, ctrl), qpos, qvel
+            )[0]
 
         got = jax.jit(rows)(*map(jnp.asarray, poses(name)))
     seen = 0
@@ -78,11 +84,19 @@ def test_constraint_rows_are_mujocos(name):
         active = np.asarray(got.stiffness[:, i]) > 0
         seen += data.nefc
         assert active.sum() == data.nefc
-        ours = np.c_[got.jacobian[:, active, i].T, got.stiffness[active, i, None], got.reference[active, i, None]]
-        theirs = np.c_[data.efc_J.reshape(data.nefc, model.nv), data.efc_D[:, None], data.efc_aref[:, None]]
+        ours = np.c_[
+            got.jacobian[:, active, i].T,
+            got.stiffness[active, i, None],
+            got.reference[active, i, None],
+        ]
+        theirs = np.c_[
+            data.efc_J.reshape(data.nefc, model.nv), data.efc_D[:, None], data.efc_aref[:, None]
+        ]
         # the order of rows is ours; a fixed mix of the columns, which are all different, sorts both in the same way
         mix = np.random.default_rng(1).normal(size=ours.shape[1])
-        assert_allclose(ours[np.argsort(ours @ mix)], theirs[np.argsort(theirs @ mix)], rtol=1e-7, atol=1e-8)
+        assert_allclose(
+            ours[np.argsort(ours @ mix)], theirs[np.argsort(theirs @ mix)], rtol=1e-7, atol=1e-8
+        )
     assert seen > 10
 
 
@@ -92,7 +106,10 @@ def test_a_rotation_by_a_vector_is_mujocos():
     quats /= np.linalg.norm(quats, axis=0)
     vectors[:, 0] = 0
     with jax.enable_x64(True):
-        got, matrices = spatial.rotate(jnp.asarray(quats), jnp.asarray(vectors)), spatial.rotation(jnp.asarray(quats))
+        got, matrices = (
+            spatial.rotate(jnp.asarray(quats), jnp.asarray(vectors)),
+            spatial.rotation(jnp.asarray(quats)),
+        )
     for i in range(30):
         want = quats[:, i].copy()
         mujoco.mju_quatIntegrate(want, vectors[:, i], 1.0)

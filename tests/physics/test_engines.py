@@ -16,7 +16,9 @@ slow = pytest.mark.slow  # MJX compiles for half a minute to a minute per model
 def test_native_is_mj_step_bit_for_bit(name):
     got, want = stepped(name, "native"), reference(name)[0]
     for field in PhysicsState._fields:
-        assert_array_equal(getattr(got, field), getattr(want, field).astype(np.float32), err_msg=field)
+        assert_array_equal(
+            getattr(got, field), getattr(want, field).astype(np.float32), err_msg=field
+        )
 
 
 FLOAT32 = [
@@ -57,7 +59,10 @@ def test_in_float64_an_engine_differs_from_c_mujoco_by_rounding(engine, name):
     assert_allclose(got.cfrc_ext, want.cfrc_ext, atol=1e-4, rtol=1e-5)
 
 
-@pytest.mark.parametrize(("engine", "x64"), [pytest.param("mjx", True, marks=slow), pytest.param("mjx-warp", False, marks=(WARP, slow))])
+@pytest.mark.parametrize(
+    ("engine", "x64"),
+    [pytest.param("mjx", True, marks=slow), pytest.param("mjx-warp", False, marks=(WARP, slow))],
+)
 def test_ant_in_mjx_agrees_with_c_mujoco_in_most_states_only(engine, x64):
     # what users of the engine get until upstream mends it: half of the states agree to 1e-3, fallen ones do not
     error = errors("ant", engine, x64=x64)

@@ -18,7 +18,9 @@ def doubled(before, after):
 
 
 def call(name, x):
-    return jax.ffi.ffi_call(name, jax.ShapeDtypeStruct(x.shape, x.dtype), vmap_method="broadcast_all")(x)
+    return jax.ffi.ffi_call(
+        name, jax.ShapeDtypeStruct(x.shape, x.dtype), vmap_method="broadcast_all"
+    )(x)
 
 
 def test_a_function_reads_and_fills_the_arrays_of_the_program():
@@ -26,7 +28,9 @@ def test_a_function_reads_and_fills_the_arrays_of_the_program():
     x = jnp.arange(24.0).reshape(2, 3, 4)
     nested = jax.jit(jax.vmap(jax.vmap(lambda x: call("test_doubled", x))))
     np.testing.assert_array_equal(nested(x), 2 * x)
-    np.testing.assert_array_equal(jax.jit(call, static_argnums=0)("test_doubled", jnp.zeros((2, 0, 6))), np.zeros((2, 0, 6)))
+    np.testing.assert_array_equal(
+        jax.jit(call, static_argnums=0)("test_doubled", jnp.zeros((2, 0, 6))), np.zeros((2, 0, 6))
+    )
     loop = jax.jit(lambda x: jax.lax.fori_loop(0, 10, lambda _, x: call("test_doubled", x), x))
     np.testing.assert_array_equal(loop(x), 1024 * x)
 
@@ -36,7 +40,9 @@ def test_float64_arrays_arrive_as_they_are():
         x = jnp.asarray([1 / 3])
         assert x.dtype == np.float64
         ffi.register("test_doubled", doubled)
-        np.testing.assert_array_equal(jax.jit(call, static_argnums=0)("test_doubled", x), 2 / 3 * np.ones(1))
+        np.testing.assert_array_equal(
+            jax.jit(call, static_argnums=0)("test_doubled", x), 2 / 3 * np.ones(1)
+        )
 
 
 def test_an_exception_ends_the_program_and_says_what_it_was():
@@ -71,8 +77,13 @@ print(json.dumps({"hits": events.count("/jax/compilation_cache/cache_hits"), "qp
 """
 
 
-def test_another_process_finds_a_program_with_native_physics_in_the_cache_and_gets_the_same_bits(tmp_path):
+def test_another_process_finds_a_program_with_native_physics_in_the_cache_and_gets_the_same_bits(
+    tmp_path,
+):
     command = [sys.executable, "-c", PROGRAM, tmp_path]
-    first, second = (json.loads(subprocess.run(command, cwd=ROOT, capture_output=True, check=True).stdout) for _ in range(2))
+    first, second = (
+        json.loads(subprocess.run(command, cwd=ROOT, capture_output=True, check=True).stdout)
+        for _ in range(2)
+    )
     assert (first["hits"], second["hits"]) == (0, 1)
     assert first["qpos"] == second["qpos"]

@@ -18,7 +18,10 @@ from tests.parity import WARP, reference, states
 
 @WARP
 def test_warp_learns_the_number_of_worlds_from_the_vmap():
-    physics, want = make_physics("mjx-warp", load_spec("hopper.xml"), 4, Reads()), reference("hopper")[0]
+    physics, want = (
+        make_physics("mjx-warp", load_spec("hopper.xml"), 4, Reads()),
+        reference("hopper")[0],
+    )
     qpos, qvel, warmstart, ctrl = (jnp.asarray(x) for x in states("hopper"))
     state = physics.at_pose(qpos, qvel)._replace(qacc_warmstart=warmstart)
     many = jax.jit(jax.vmap(physics.step))(state, ctrl)
@@ -36,7 +39,9 @@ def test_warp_learns_the_number_of_worlds_from_the_vmap():
 def test_warp_keeps_the_dtype_of_the_state_it_was_given():
     with jax.enable_x64(True):
         physics = make_physics("mjx-warp", load_spec("swimmer.xml"), 1, Reads())
-        after = jax.eval_shape(physics.step, physics.at_pose(jnp.zeros(5), jnp.zeros(5)), jnp.zeros(2))
+        after = jax.eval_shape(
+            physics.step, physics.at_pose(jnp.zeros(5), jnp.zeros(5)), jnp.zeros(2)
+        )
     assert after.qpos.dtype == after.qvel.dtype == "float64"
 
 
@@ -63,4 +68,9 @@ from dgae_jax.physics.engine import Reads
 from dgae_jax.physics.registry import make_physics
 physics = make_physics("mjx-warp", load_spec("hopper.xml"), 4, Reads())
 jax.block_until_ready(jax.jit(physics.step)(physics.at_pose(jnp.zeros(6), jnp.zeros(6)), jnp.zeros(3)))"""
-    assert subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True).stdout == ""
+    assert (
+        subprocess.run(
+            [sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True
+        ).stdout
+        == ""
+    )

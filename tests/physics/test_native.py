@@ -34,7 +34,9 @@ def test_where_the_device_is_not_the_cpu_a_callback_returns_the_same_bits(forces
     state = physics.at_pose(qpos, qvel)
     after = jax.jit(jax.vmap(jax.vmap(physics.step)))(state, ctrl)
     like = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape[2:], x.dtype), tuple(state))
-    for ours, theirs in zip(after, _Host(physics.model, 5, reads).returned(like, *state[:3], ctrl), strict=True):
+    for ours, theirs in zip(
+        after, _Host(physics.model, 5, reads).returned(like, *state[:3], ctrl), strict=True
+    ):
         assert_array_equal(ours, theirs)
     assert after.cfrc_ext.size == (2 * 3 * 14 * 6 if forces else 0)
 
@@ -48,12 +50,17 @@ def test_a_non_finite_state_can_be_seen():
 
 
 @pytest.mark.parametrize("forces", [False, True])
-def test_mujocos_warnings_are_counted_and_said_once_and_leave_no_file(forces, monkeypatch, tmp_path, capfd, caplog):
+def test_mujocos_warnings_are_counted_and_said_once_and_leave_no_file(
+    forces, monkeypatch, tmp_path, capfd, caplog
+):
     monkeypatch.setattr(quiet, "COUNTS", Counter())
     monkeypatch.chdir(tmp_path)
     physics = native(load_spec("hopper.xml"), 4, Reads(forces=forces))
     qpos, qvel, _, ctrl = (jnp.asarray(x[:8]) for x in states("hopper"))
-    step, broken = jax.jit(jax.vmap(physics.step)), physics.at_pose(qpos.at[:3, 2].set(jnp.nan), qvel)
+    step, broken = (
+        jax.jit(jax.vmap(physics.step)),
+        physics.at_pose(qpos.at[:3, 2].set(jnp.nan), qvel),
+    )
     with caplog.at_level(logging.WARNING):
         for _ in range(5):
             jax.block_until_ready(step(broken, ctrl))
@@ -82,7 +89,9 @@ def test_whoever_listens_to_mujocos_warnings_hears_them_again_afterwards():
 
 
 def warn_once():
-    model = mujoco.MjModel.from_xml_string("<mujoco><worldbody><body><joint/><geom size='1'/></body></worldbody></mujoco>")
+    model = mujoco.MjModel.from_xml_string(
+        "<mujoco><worldbody><body><joint/><geom size='1'/></body></worldbody></mujoco>"
+    )
     data = mujoco.MjData(model)
     data.qpos[0] = float("nan")
     mujoco.mj_checkPos(model, data)

@@ -19,7 +19,11 @@ def problems(count, rows=12, size=5, seed=0):
     stiffness = 10 ** rng.uniform(-1, 3, (count, rows))
     force = np.einsum("wij,wj->wi", mass, smooth)
     arrays = (mass, force, jacobian.swapaxes(1, 2), stiffness, reference)
-    return newton.Problem(*(jnp.asarray(np.moveaxis(x, 0, -1)) for x in arrays)), smooth, jnp.asarray(rng.normal(size=(size, count)))
+    return (
+        newton.Problem(*(jnp.asarray(np.moveaxis(x, 0, -1)) for x in arrays)),
+        smooth,
+        jnp.asarray(rng.normal(size=(size, count))),
+    )
 
 
 def optimum(p, smooth, i):
@@ -34,7 +38,9 @@ def optimum(p, smooth, i):
         short = np.minimum(a @ jacobian_t - reference, 0)
         return mass @ (a - smooth[i]) + jacobian_t @ (stiffness * short)
 
-    return scipy.optimize.minimize(cost, smooth[i], jac=slope, method="BFGS", options={"gtol": 1e-9, "maxiter": 10_000}).x
+    return scipy.optimize.minimize(
+        cost, smooth[i], jac=slope, method="BFGS", options={"gtol": 1e-9, "maxiter": 10_000}
+    ).x
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -67,7 +73,11 @@ def test_a_row_of_zero_stiffness_does_not_count():
         p, _, guess = problems(30)
         fewer = newton.Problem(p.mass, p.force, *(x[..., :-1, :] for x in p[2:]))
         same = p._replace(stiffness=p.stiffness.at[-1].set(0))
-        assert_allclose(newton.solve(same, guess).acceleration, newton.solve(fewer, guess).acceleration, atol=1e-9)
+        assert_allclose(
+            newton.solve(same, guess).acceleration,
+            newton.solve(fewer, guess).acceleration,
+            atol=1e-9,
+        )
 
 
 @pytest.mark.parametrize("count", [1, 3, 16, 40, 300])
@@ -92,5 +102,7 @@ def test_a_problem_that_is_not_finite_ends_and_does_not_disturb_the_others():
 def test_the_line_search_is_exact_on_a_kink_by_hand():
     # cost ½(1 - t)²·2 from the step, plus ½·8·min(t - ½ ... )²: one row, r = 1, moving by -2 per unit step, D = 2
     # derivative: -1 + t (step), + 2·(1 - 2t)·(-2) once 1 - 2t < 0: -1 + t - 4 + 8t = 0 at t = 5/9
-    length = newton._line_search(*map(jnp.array, ([-1.0], [1.0], [[2.0]], [[1.0]], [[-2.0]], [False])))
+    length = newton._line_search(
+        *map(jnp.array, ([-1.0], [1.0], [[2.0]], [[1.0]], [[-2.0]], [False]))
+    )
     assert_allclose(length, [5 / 9], rtol=1e-6)

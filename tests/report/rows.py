@@ -4,23 +4,37 @@ import json
 
 import numpy as np
 
-from dgae_jax.configs.config import resolve
 from dgae_jax.configs.presets import preset
+from dgae_jax.configs.resolved import resolve
 from dgae_jax.configs.serial import to_dict
 
 ALGORITHMS = ("ppo", "dppo", "trpo", "dtrpo", "a2c", "da2c")
-HEIGHT = {"ppo": 3000.0, "dppo": 3300.0, "trpo": 2400.0, "dtrpo": 2700.0, "a2c": 900.0, "da2c": 1000.0}
+HEIGHT = {
+    "ppo": 3000.0,
+    "dppo": 3300.0,
+    "trpo": 2400.0,
+    "dtrpo": 2700.0,
+    "a2c": 900.0,
+    "da2c": 1000.0,
+}
 
 
 def row(env="hopper", algo="dppo", seed=0, **changes):
     """One row; `changes` replace what is in it."""
-    config = json.loads(json.dumps(to_dict(resolve(preset("tuned", algo, env)))))  # with lists for tuples, as in a file
+    config = json.loads(
+        json.dumps(to_dict(resolve(preset("tuned", algo, env))))
+    )  # with lists for tuples, as in a file
     generator = np.random.default_rng([seed, ALGORITHMS.index(algo), len(env)])
     height = HEIGHT[algo] * generator.normal(1, 0.15)
     steps = np.linspace(5_000, 999_424, 120).astype(int)
     curve = height * (1 - np.exp(-steps / 250_000)) + generator.normal(0, 60, len(steps))
     returns = generator.normal(height, 20, 20)
-    best = {"steps": 800_000, "return_mean": height + 50, "return_std": 10.0, "returns": [height + 50] * 20}
+    best = {
+        "steps": 800_000,
+        "return_mean": height + 50,
+        "return_std": 10.0,
+        "returns": [height + 50] * 20,
+    }
     found = {
         "cell": f"{env}-{algo}-{seed}", "env": env, "env_version": config["env_version"], "algo": algo, "physics": config["physics"],
         "variant": None, "seed": seed, "total_steps": 1_000_000, "steps": 999_424, "hash": f"{env}{algo}".ljust(12, "0")[:12],
@@ -41,7 +55,13 @@ def row(env="hopper", algo="dppo", seed=0, **changes):
 def plain(scores, env="hopper", algo="dppo", **changes):
     """Rows with these final returns, one per seed, and nothing else of interest."""
     return [
-        row(env, algo, seed, **{"final": {"engine": "gymnasium", "return_mean": score, "returns": [score]}} | changes)
+        row(
+            env,
+            algo,
+            seed,
+            **{"final": {"engine": "gymnasium", "return_mean": score, "returns": [score]}}
+            | changes,
+        )
         for seed, score in enumerate(scores)
     ]
 

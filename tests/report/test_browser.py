@@ -11,7 +11,10 @@ from dgae_jax.report import results
 from dgae_jax.report.page import page
 from tests.report.rows import study, whole
 
-CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome", "chrome"))), None)
+CHROMIUM = next(
+    filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome", "chrome"))),
+    None,
+)
 
 pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="no chromium is on the PATH")
 
@@ -30,7 +33,9 @@ def seen(text, directory):
     argv = ["--headless", "--no-sandbox", "--disable-gpu", "--hide-scrollbars", "--allow-file-access-from-files",
             f"--user-data-dir={directory / 'profile'}",
             "--enable-logging=stderr", "--virtual-time-budget=5000", "--dump-dom", (directory / "frame.html").as_uri()]  # fmt: skip
-    done = subprocess.run([CHROMIUM, *argv], capture_output=True, text=True, timeout=120, check=True)
+    done = subprocess.run(
+        [CHROMIUM, *argv], capture_output=True, text=True, timeout=120, check=True
+    )
     numbers = re.search(r'data-seen="([^"]*)"', done.stdout)
     return json.loads(numbers[1]), re.findall(r"CONSOLE.*", done.stderr)
 

@@ -55,7 +55,12 @@ def read(tmp_path):
 def test_the_page_needs_no_other_file_and_no_script(read):
     text, found = read(whole(("hopper", "ant"), ("ppo", "dppo"), 2))
     assert not {"script", "link", "iframe", "object", "embed"} & {tag for tag, _ in found.tags}
-    sources = [attributes[name] for _, attributes in found.tags for name in ("src", "href", "srcset", "poster") if name in attributes]
+    sources = [
+        attributes[name]
+        for _, attributes in found.tags
+        for name in ("src", "href", "srcset", "poster")
+        if name in attributes
+    ]
     assert len(sources) > 5
     assert all(source.startswith(("data:", "#")) for source in sources)
     assert not re.search(r"@import|url\(", text)
@@ -86,7 +91,12 @@ def test_pictures_are_whole_and_say_what_they_show(read):
 def test_what_comes_from_outside_is_escaped(read):
     evil = '<script>alert("x")</script>'
     fields = dict.fromkeys(("cell", "env", "command", "git_revision"), evil)
-    more = {"machine": {evil: evil}, "versions": {evil: evil}, "config": {evil: {"a": evil}}, "env_version": None}
+    more = {
+        "machine": {evil: evil},
+        "versions": {evil: evil},
+        "config": {evil: {"a": evil}},
+        "env_version": None,
+    }
     text, found = read([row() | fields | more])
     assert "<script" not in text
     assert evil in "".join(found.words)
@@ -95,8 +105,21 @@ def test_what_comes_from_outside_is_escaped(read):
 def test_settings_that_differ_from_the_first_of_the_algorithm_are_highlighted(read):
     first = row("hopper", "ppo")
     policy = first["config"]["policy"] | {"initial_std": 3.0}
-    changed = {"env": "walker2d", "num_envs": 7, "horizon": 9, "gamma": 0.5, "lam": 0.25, "policy": policy}
-    _, found = read([first, row("walker2d", "ppo") | {"config": first["config"] | changed}, row("swimmer", "dppo")])
+    changed = {
+        "env": "walker2d",
+        "num_envs": 7,
+        "num_steps": 9,
+        "gamma": 0.5,
+        "lam": 0.25,
+        "policy": policy,
+    }
+    _, found = read(
+        [
+            first,
+            row("walker2d", "ppo") | {"config": first["config"] | changed},
+            row("swimmer", "dppo"),
+        ]
+    )
     assert found.text_of("mark") == ["walker2d", "7", "9", "0.5", "0.25", "3.0"]
 
 
@@ -114,24 +137,39 @@ def test_cells_without_a_result_are_named(tmp_path):
 
 def test_one_seed_has_dashes_for_intervals_and_one_algorithm_no_pairs(read):
     _, found = read([row()])
-    assert "1 trained run: 1 task, 1 algorithm, 1 seed, 1,000,000 environment steps each." in found.words
+    assert (
+        "1 trained run: 1 task, 1 algorithm, 1 seed, 1,000,000 environment steps each."
+        in found.words
+    )
     assert any(word.endswith("[–]") for word in found.words)
     assert "Probability of improvement" not in found.words
 
 
 def test_a_video_of_a_task_is_in_the_page(tmp_path):
-    path = study(tmp_path / "films", [row(), row("ant"), row() | {"env": "brax:ant", "env_version": None, "cell": "b"}])
+    path = study(
+        tmp_path / "films",
+        [row(), row("ant"), row() | {"env": "brax:ant", "env_version": None, "cell": "b"}],
+    )
     (path / "videos").mkdir()
     for name in ("hopper", "brax-ant"):
         (path / "videos" / f"{name}.mp4").write_bytes(name.encode())
     films = Reader(page([results.read(path)])).all("video")
-    assert [base64.b64decode(film["src"].removeprefix("data:video/mp4;base64,")) for film in films] == [b"hopper", b"brax-ant"]
+    assert [
+        base64.b64decode(film["src"].removeprefix("data:video/mp4;base64,")) for film in films
+    ] == [b"hopper", b"brax-ant"]
 
 
 def test_published_results_are_listed_with_their_sources(tmp_path):
-    known = [Published("hopper", 10**6, "PPO", 2609.0, 701.0, 10, "Tianshou"), Published("ant", 10**6, "PPO", 3258.0, None, None, "Other")]
+    known = [
+        Published("hopper", 10**6, "PPO", 2609.0, 701.0, 10, "Tianshou"),
+        Published("ant", 10**6, "PPO", 3258.0, None, None, "Other"),
+    ]
     words = Reader(page([results.read(study(tmp_path / "one", [row()]))], known)).words
-    assert words[words.index("2,609 ± 701") : words.index("Tianshou") + 1] == ["2,609 ± 701", "10", "Tianshou"]
+    assert words[words.index("2,609 ± 701") : words.index("Tianshou") + 1] == [
+        "2,609 ± 701",
+        "10",
+        "Tianshou",
+    ]
     assert "Other" not in words  # a task that the study does not have
 
 

@@ -20,13 +20,30 @@ def refusal(path):
 
 def test_a_row_is_what_the_file_says(tmp_path):
     curve = {"steps": [5, 10], "return": [None, 2.5]}
-    written = row("hopper", "ppo", 3, curve=curve, final={"engine": "gymnasium", "return_mean": 7, "returns": [9, 5]}, seconds=9.5)
+    written = row(
+        "hopper",
+        "ppo",
+        3,
+        curve=curve,
+        final={"engine": "gymnasium", "return_mean": 7, "returns": [9, 5]},
+        seconds=9.5,
+    )
     (read,) = results.read(study(tmp_path, [written])).rows
-    assert (read.cell, read.task, read.algo, read.seed, read.seconds) == ("hopper-ppo-3", "hopper-v4", "ppo", 3, 9.5)
+    assert (read.cell, read.task, read.algo, read.seed, read.seconds) == (
+        "hopper-ppo-3",
+        "hopper-v4",
+        "ppo",
+        3,
+        9.5,
+    )
     assert (read.final, read.worst) == (7.0, 5.0)
     np.testing.assert_array_equal(read.curve_steps, [5, 10])
     np.testing.assert_array_equal(read.curve_returns, [np.nan, 2.5])
-    assert (read.best, read.best_steps, read.config) == (written["best"]["return_mean"], 800_000, written["config"])
+    assert (read.best, read.best_steps, read.config) == (
+        written["best"]["return_mean"],
+        800_000,
+        written["config"],
+    )
 
 
 def test_a_run_without_evaluations_along_the_way_has_no_best(tmp_path):
@@ -49,15 +66,23 @@ def test_a_row_that_is_still_being_written_is_not_there_yet(tmp_path):
 
 
 def test_what_is_no_study_is_refused(tmp_path):
-    assert refusal(tmp_path / "none") == f"{tmp_path}/none: must be the directory of a study; there is nothing"
-    assert refusal(tmp_path) == f"{tmp_path}: must be the directory of a study, with study.json and results.jsonl"
+    assert (
+        refusal(tmp_path / "none")
+        == f"{tmp_path}/none: must be the directory of a study; there is nothing"
+    )
+    assert (
+        refusal(tmp_path)
+        == f"{tmp_path}: must be the directory of a study, with study.json and results.jsonl"
+    )
     (tmp_path / "study.json").write_text('{"cells": {}}')
     assert refusal(tmp_path) == f"{tmp_path}: must have results; results.jsonl has none yet"
     (tmp_path / "results.jsonl").write_text("")
     assert refusal(tmp_path) == f"{tmp_path}: must have results; results.jsonl has none yet"
     study(tmp_path, [row()])
     (tmp_path / "study.json").write_text("[]")
-    assert refusal(tmp_path) == f"{tmp_path}/study.json: must be an object with the cells of the study"
+    assert (
+        refusal(tmp_path) == f"{tmp_path}/study.json: must be an object with the cells of the study"
+    )
 
 
 def test_a_line_that_is_no_row_is_refused_by_its_number(tmp_path):
@@ -68,7 +93,9 @@ def test_a_line_that_is_no_row_is_refused_by_its_number(tmp_path):
 
 
 def test_a_seed_that_is_there_twice_is_refused(tmp_path):
-    assert refusal(study(tmp_path, [row(), row()])).endswith("line 2: cell hopper-dppo-0, seed 0 is there twice")
+    assert refusal(study(tmp_path, [row(), row()])).endswith(
+        "line 2: cell hopper-dppo-0, seed 0 is there twice"
+    )
 
 
 @pytest.mark.parametrize(
@@ -82,18 +109,35 @@ def test_a_seed_that_is_there_twice_is_refused(tmp_path):
         ({"seconds": None}, "seconds: must be a number"),
         ({"final": None}, "final: must be an object"),
         ({"final": {"engine": "gymnasium"}}, "final.return_mean: missing"),
-        ({"final": {"engine": "gymnasium", "return_mean": float("nan")}}, "final.return_mean: must be a number"),
-        ({"final": {"engine": "gymnasium", "return_mean": 1, "returns": []}}, "final.returns: must be a list of numbers, one at least"),
+        (
+            {"final": {"engine": "gymnasium", "return_mean": float("nan")}},
+            "final.return_mean: must be a number",
+        ),
+        (
+            {"final": {"engine": "gymnasium", "return_mean": 1, "returns": []}},
+            "final.returns: must be a list of numbers, one at least",
+        ),
         ({"best": {"steps": 5}}, "best.return_mean: missing"),
         ({"best": 3}, "best: must be an object or null"),
-        ({"curve": {"steps": [1, 2], "return": [1.0]}}, "curve: must have increasing steps and a return for each"),
-        ({"curve": {"steps": [2, 2], "return": [1.0, 2.0]}}, "curve: must have increasing steps and a return for each"),
-        ({"curve": {"steps": [1], "return": ["x"]}}, "curve.return: must be a list of numbers, null where there is none"),
+        (
+            {"curve": {"steps": [1, 2], "return": [1.0]}},
+            "curve: must have increasing steps and a return for each",
+        ),
+        (
+            {"curve": {"steps": [2, 2], "return": [1.0, 2.0]}},
+            "curve: must have increasing steps and a return for each",
+        ),
+        (
+            {"curve": {"steps": [1], "return": ["x"]}},
+            "curve.return: must be a list of numbers, null where there is none",
+        ),
         ({"curve": {"steps": 1, "return": []}}, "curve.steps: must be a list of whole numbers"),
     ],
 )
 def test_a_field_that_is_wrong_is_named_with_what_it_must_be(change, sentence, tmp_path):
-    assert refusal(study(tmp_path, [row() | change])) == f"{tmp_path}/results.jsonl line 1: {sentence}"
+    assert (
+        refusal(study(tmp_path, [row() | change])) == f"{tmp_path}/results.jsonl line 1: {sentence}"
+    )
 
 
 @pytest.mark.parametrize("name", [name for name in results.FIELDS if "." not in name])
@@ -111,13 +155,22 @@ def test_a_run_whose_return_is_not_finite_has_no_result_and_that_is_said(tmp_pat
     found = results.read(directory)
     assert [each.seed for each in found.rows] == [0, 2]
     assert (found.diverged, found.missing) == (((diverged["cell"], 1),), [])
-    assert f"results.jsonl line 2: left out, because the return of cell {diverged['cell']}, seed 1 is not finite" in capsys.readouterr().err
+    assert (
+        f"results.jsonl line 2: left out, because the return of cell {diverged['cell']}, seed 1 is not finite"
+        in capsys.readouterr().err
+    )
     content = page.Content(found, groups_of(found.rows), [])
-    assert f"Left out, because their return is not finite: seed 1 of {diverged['cell']}." in page._summary(content)
+    assert (
+        f"Left out, because their return is not finite: seed 1 of {diverged['cell']}."
+        in page._summary(content)
+    )
 
 
 def test_a_line_that_is_no_row_behind_one_that_is_left_out_is_named_by_its_number(tmp_path):
-    directory = study(tmp_path, [row(seed=0), row(seed=1, final={"engine": "jax", "return_mean": None, "returns": [None]})])
+    directory = study(
+        tmp_path,
+        [row(seed=0), row(seed=1, final={"engine": "jax", "return_mean": None, "returns": [None]})],
+    )
     with (directory / "results.jsonl").open("a") as file:
         file.write("nonsense\n")
     assert refusal(directory).endswith("results.jsonl line 3: must be an object in JSON")

@@ -28,17 +28,24 @@ def test_the_interquartile_mean_leaves_out_a_quarter_at_each_end(scores, mean):
 def test_the_probability_of_improvement_counts_ties_half_and_tasks_alike():
     x, y = np.array([1.0, 2.0, 3.0]), np.array([2.0, 2.0])
     assert st.improvement([x], [y]) == 0.5  # of six pairs two are won and two are ties: (2 + 1) / 6
-    assert st.improvement([x, np.array([5.0])], [y, np.array([1.0, 9.0, 9.0, 9.0])]) == (0.5 + 0.25) / 2
+    assert (
+        st.improvement([x, np.array([5.0])], [y, np.array([1.0, 9.0, 9.0, 9.0])])
+        == (0.5 + 0.25) / 2
+    )
 
 
 def test_a_profile_is_the_share_of_runs_above_each_score():
-    shares = st.performance_profile([np.array([0.1, 0.5]), np.array([0.9])], np.array([0.0, 0.1, 0.5, 0.95]))
+    shares = st.performance_profile(
+        [np.array([0.1, 0.5]), np.array([0.9])], np.array([0.0, 0.1, 0.5, 0.95])
+    )
     np.testing.assert_allclose(shares, [1, 2 / 3, 1 / 3, 0])
 
 
 def test_the_interval_of_two_seeds_lies_between_them():
     """Of the draws a quarter is twice the lower and a quarter twice the higher."""
-    np.testing.assert_array_equal(st.interval(st.interquartile_mean, [np.array([1.0, 3.0])]), [1, 3])
+    np.testing.assert_array_equal(
+        st.interval(st.interquartile_mean, [np.array([1.0, 3.0])]), [1, 3]
+    )
 
 
 def test_seeds_are_drawn_within_their_task():
@@ -57,7 +64,9 @@ def test_a_task_with_a_single_seed_has_no_interval():
 def test_the_same_scores_give_the_same_interval_and_leave_numpys_generator_alone():
     scores = [np.random.default_rng(1).normal(size=9)]
     state = np.random.get_state()[1].copy()  # noqa: NPY002
-    np.testing.assert_array_equal(st.interval(st.interquartile_mean, scores), st.interval(st.interquartile_mean, scores))
+    np.testing.assert_array_equal(
+        st.interval(st.interquartile_mean, scores), st.interval(st.interquartile_mean, scores)
+    )
     np.testing.assert_array_equal(np.random.get_state()[1], state)  # noqa: NPY002
 
 
@@ -65,7 +74,9 @@ def test_the_interval_of_a_mean_is_that_of_the_normal_distribution_where_there_a
     scores = np.random.default_rng(0).normal(10, 2, 400)
     low, high = st.interval(lambda strata: strata[0].mean(-1), [scores])
     error = 1.96 * scores.std(ddof=1) / 20
-    np.testing.assert_allclose([low - scores.mean(), high - scores.mean()], [-error, error], rtol=0.05)
+    np.testing.assert_allclose(
+        [low - scores.mean(), high - scores.mean()], [-error, error], rtol=0.05
+    )
 
 
 def test_the_difference_of_two_samples_is_second_minus_first_and_both_are_drawn():
@@ -84,8 +95,12 @@ def scores():
 
 def test_point_values_are_those_of_scipy(scores):
     x, y = scores
-    assert st.interquartile_mean(list(x.T)) == pytest.approx(stats.trim_mean(x, 0.25, axis=None), rel=1e-14)
-    won = stats.mannwhitneyu(x, y).statistic / (len(x) * len(y))  # per task: pairs won, ties counted half
+    assert st.interquartile_mean(list(x.T)) == pytest.approx(
+        stats.trim_mean(x, 0.25, axis=None), rel=1e-14
+    )
+    won = stats.mannwhitneyu(x, y).statistic / (
+        len(x) * len(y)
+    )  # per task: pairs won, ties counted half
     assert st.improvement(list(x.T), list(y.T)) == pytest.approx(won.mean(), rel=1e-14)
     taus = np.linspace(0, 2, 21)
     above = 1 - stats.ecdf(x.ravel()).cdf.evaluate(taus)
@@ -99,7 +114,13 @@ def _iqm(*tasks, axis):
 def _wins(*tasks, axis):
     half = len(tasks) // 2
     pairs = zip(tasks[:half], tasks[half:], strict=True)
-    return np.mean([stats.mannwhitneyu(x, y, axis=axis).statistic / (x.shape[axis] * y.shape[axis]) for x, y in pairs], axis=0)
+    return np.mean(
+        [
+            stats.mannwhitneyu(x, y, axis=axis).statistic / (x.shape[axis] * y.shape[axis])
+            for x, y in pairs
+        ],
+        axis=0,
+    )
 
 
 @pytest.mark.parametrize("theirs", [_iqm, _wins])
@@ -107,9 +128,16 @@ def test_intervals_are_those_of_scipys_bootstrap_up_to_chance(theirs, scores):
     """Tasks are SciPy's independent samples. The ends are sure to about 2 % of an interval's width; four such errors are allowed."""
     x, y = (list(each.T) for each in scores)
     samples, ours = ((x,), st.interquartile_mean) if theirs is _iqm else ((x, y), st.improvement)
-    tasks, how = [task for strata in samples for task in strata], {"method": "percentile", "vectorized": True, "batch": 500}
-    known = stats.bootstrap(tasks, theirs, n_resamples=5000, rng=np.random.default_rng(7), **how).confidence_interval
-    np.testing.assert_allclose(st.interval(ours, *samples), known, atol=0.08 * (known.high - known.low))
+    tasks, how = (
+        [task for strata in samples for task in strata],
+        {"method": "percentile", "vectorized": True, "batch": 500},
+    )
+    known = stats.bootstrap(
+        tasks, theirs, n_resamples=5000, rng=np.random.default_rng(7), **how
+    ).confidence_interval
+    np.testing.assert_allclose(
+        st.interval(ours, *samples), known, atol=0.08 * (known.high - known.low)
+    )
 
 
 def test_curves_are_compared_at_the_steps_that_all_of_them_cover():
@@ -123,7 +151,9 @@ def test_curves_are_compared_at_the_steps_that_all_of_them_cover():
 
 def test_curves_with_the_same_steps_are_what_they_are_and_nulls_between_are_bridged():
     steps = np.array([1.0, 2, 3])
-    at, values = st.common_curve([(steps, np.array([1.0, np.nan, 5])), (steps, np.array([4.0, 5, 6]))])
+    at, values = st.common_curve(
+        [(steps, np.array([1.0, np.nan, 5])), (steps, np.array([4.0, 5, 6]))]
+    )
     np.testing.assert_array_equal(at, steps)
     np.testing.assert_array_equal(values, [[1, 3, 5], [4, 5, 6]])
 

@@ -11,7 +11,15 @@ def test_final_returns_are_mean_std_iqm_best_and_each_seed(grouped):
     best = {"best": {"steps": 5, "return_mean": 1500.0}}
     rows = plain([1000, 3000], algo="ppo", **best) + plain([1234.5], algo="dppo", best=None)
     assert tables.returns(grouped(rows)).rows == [
-        ("hopper-v4", "PPO", "2", "2,000 ± 1,414", "2,000 [1,000, 3,000]", "1,500 ± 0", "1,000 · 3,000"),
+        (
+            "hopper-v4",
+            "PPO",
+            "2",
+            "2,000 ± 1,414",
+            "2,000 [1,000, 3,000]",
+            "1,500 ± 0",
+            "1,000 · 3,000",
+        ),
         ("hopper-v4", "DPPO", "1", "1,234 ± –", "1,234 [–]", "–", "1,234"),
     ]
 
@@ -21,19 +29,30 @@ def test_samples_to_reach_are_whole_numbers_or_a_dash(grouped):
     dppo = plain([1], algo="dppo", curve={"steps": [10, 2000], "return": [None, 60]})
     table = tables.reach(grouped(ppo + dppo))
     assert table.header == ("task", "algorithm", "best mean", "samples to 50 %", "samples to 90 %")
-    assert table.rows == [("hopper-v4", "PPO", "100", "2,000", "2,000"), ("hopper-v4", "DPPO", "100", "2,000", "–")]
+    assert table.rows == [
+        ("hopper-v4", "PPO", "100", "2,000", "2,000"),
+        ("hopper-v4", "DPPO", "100", "2,000", "–"),
+    ]
 
 
 def test_speed_is_samples_and_seconds_and_the_machine(grouped):
     rows = plain([1, 2], samples_per_second=12_000.0, seconds=80.0)
-    assert tables.speed(grouped(rows)).rows == [("hopper-v4", "DPPO", "12,000 ± 0", "80 ± 0", "cpu: x, 1 cores")]
+    assert tables.speed(grouped(rows)).rows == [
+        ("hopper-v4", "DPPO", "12,000 ± 0", "80 ± 0", "cpu: x, 1 cores")
+    ]
 
 
 def test_two_studies_are_compared_where_both_have_results(grouped):
     first = grouped(plain([1, 3]) + plain([4], algo="ppo"))
     second = grouped(plain([10, 10]) + plain([7, 7], algo="a2c"))
     table = tables.comparison(first, second, ("A", "B"))
-    assert table.header == ("task", "algorithm", "A, IQM [95 %]", "B, IQM [95 %]", "difference [95 %]")
+    assert table.header == (
+        "task",
+        "algorithm",
+        "A, IQM [95 %]",
+        "B, IQM [95 %]",
+        "difference [95 %]",
+    )
     assert table.rows == [
         ("hopper-v4", "PPO", "4 [–]", "–", "–"),
         ("hopper-v4", "DPPO", "2 [1, 3]", "10 [10, 10]", "+8 [+7, +9]"),
@@ -41,7 +60,9 @@ def test_two_studies_are_compared_where_both_have_results(grouped):
     ]
 
 
-def test_variants_are_named_and_compared_with_the_first_of_their_task_noise_making_another_task(grouped):
+def test_variants_are_named_and_compared_with_the_first_of_their_task_noise_making_another_task(
+    grouped,
+):
     noise = row("hopper", "dppo")["config"] | {"noise": {"reward": 0.5}}
 
     def trained(scores, average, variant, **changes):
@@ -64,7 +85,14 @@ def test_variants_are_named_and_compared_with_the_first_of_their_task_noise_maki
 
 def test_over_tasks_a_variant_is_above_the_first_as_often_as_its_seeds_are_on_average(grouped):
     def trained(scores, variant, env, **changes):
-        return plain(scores, env=env, variant=variant, cell=f"{env}-{variant}", curve={"steps": [1, 2], "return": [1, 1]}, **changes)
+        return plain(
+            scores,
+            env=env,
+            variant=variant,
+            cell=f"{env}-{variant}",
+            curve={"steps": [1, 2], "return": [1, 1]},
+            **changes,
+        )
 
     rows = [
         *trained([2, 4], "scalar", "hopper", algo="ppo"),
@@ -74,21 +102,32 @@ def test_over_tasks_a_variant_is_above_the_first_as_often_as_its_seeds_are_on_av
         *trained([9, 9], "kappa", "walker2d"),
     ]
     table = tables.attribution_over_tasks(grouped(rows))
-    assert table.rows == [  # on Hopper three of the four pairs are won, on Walker2d all; over the run all are equal, which counts a half
-        ("DPPO (kappa)", "2", "4", "0.88 [0.50, 1.00]", "0.50 [0.50, 0.50]"),
-        ("DPPO (bellman)", "1", "2", "0.50 [0.00, 1.00]", "0.50 [0.50, 0.50]"),
-    ]
+    assert (
+        table.rows
+        == [  # on Hopper three of the four pairs are won, on Walker2d all; over the run all are equal, which counts a half
+            ("DPPO (kappa)", "2", "4", "0.88 [0.50, 1.00]", "0.50 [0.50, 0.50]"),
+            ("DPPO (bellman)", "1", "2", "0.50 [0.00, 1.00]", "0.50 [0.50, 0.50]"),
+        ]
+    )
 
 
 def test_the_risk_of_a_policy_is_the_mean_of_the_worst_quarter_of_its_episodes(grouped):
     final = {"engine": "native", "return_mean": 7.75}
-    rows = plain([0], final=final | {"returns": [11, 3, 9, 10, 5, 8, 7, 9]}) + plain([0, 0], final=final | {"returns": [8]})[1:]
-    assert tables.risk(grouped(rows)).rows == [("hopper-v4", "DPPO", "2", "8 ± 0", "8 [8, 8]", "6 ± 3", "6 [4, 8]")]
+    rows = (
+        plain([0], final=final | {"returns": [11, 3, 9, 10, 5, 8, 7, 9]})
+        + plain([0, 0], final=final | {"returns": [8]})[1:]
+    )
+    assert tables.risk(grouped(rows)).rows == [
+        ("hopper-v4", "DPPO", "2", "8 ± 0", "8 [8, 8]", "6 ± 3", "6 [4, 8]")
+    ]
 
 
 def test_markdown_has_numbers_to_the_right_and_no_bars_inside_cells():
     table = tables.Table(("task", "algorithm", "x"), [("a|b", "PPO", "1")])
-    assert tables.markdown(table) == "| task | algorithm | x |\n| --- | --- | ---: |\n| a\\|b | PPO | 1 |"
+    assert (
+        tables.markdown(table)
+        == "| task | algorithm | x |\n| --- | --- | ---: |\n| a\\|b | PPO | 1 |"
+    )
 
 
 DOCUMENT = """# Title
@@ -119,8 +158,12 @@ def test_a_table_of_a_study_is_replaced_by_a_report_on_that_study_only(grouped, 
     text = "<!-- dgae report: returns of short -->\n<!-- /dgae report -->\n<!-- dgae report: speed of long -->\n<!-- /dgae report -->\n"
     path.write_text(text)
     assert markdown.replace(path, groups, "long") == ["speed"]
-    assert path.read_text() == text.replace("of long -->\n", "of long -->\n" + tables.markdown(tables.speed(groups)) + "\n")
-    with pytest.raises(ConfigError, match="must be a file with a table of other; its tables are of short, long"):
+    assert path.read_text() == text.replace(
+        "of long -->\n", "of long -->\n" + tables.markdown(tables.speed(groups)) + "\n"
+    )
+    with pytest.raises(
+        ConfigError, match="must be a file with a table of other; its tables are of short, long"
+    ):
         markdown.replace(path, groups, "other")
 
 
@@ -148,6 +191,10 @@ def test_markers_that_do_not_match_are_refused(text, sentence, tmp_path):
 
 def test_a_document_that_cannot_be_read_is_refused(tmp_path):
     (tmp_path / "bytes").write_bytes(b"\xff")
-    for name, reason in (("none", "No such file or directory"), ("bytes", "not text in UTF-8"), (".", "Is a directory")):
+    for name, reason in (
+        ("none", "No such file or directory"),
+        ("bytes", "not text in UTF-8"),
+        (".", "Is a directory"),
+    ):
         with pytest.raises(ConfigError, match=reason):
             markdown.blocks(tmp_path / name, "study")

@@ -6,7 +6,7 @@ from functools import cache
 
 import pytest
 
-from dgae_jax.configs.build import make_task, make_trainer, seed_keys
+from dgae_jax.learn.build import make_task, make_trainer, seed_keys
 from dgae_jax.run import training
 from dgae_jax.run.loop import train
 from tests.runs import QUIET, SMALL, small

@@ -8,8 +8,8 @@ import jax
 import numpy as np
 import pytest
 
-from dgae_jax.configs.build import make_greedy, make_task
 from dgae_jax.configs.config import ConfigError, NoiseConfig
+from dgae_jax.learn.build import make_greedy, make_task
 from dgae_jax.run import api, directory, restore
 from dgae_jax.run import record as record_module
 from dgae_jax.run.api import load_policy, train
@@ -24,19 +24,27 @@ def observations(*shape):
     return np.random.default_rng(0).normal(size=(*shape, 11)).astype(np.float32)
 
 
-def test_a_run_without_a_directory_leaves_nothing_but_what_it_returns(finished, tmp_path, monkeypatch, capsys):
+def test_a_run_without_a_directory_leaves_nothing_but_what_it_returns(
+    finished, tmp_path, monkeypatch, capsys
+):
     monkeypatch.setattr(api.tempfile, "tempdir", str(tmp_path))
     run = train(small(), quiet=True, **CHOSEN)
     assert capsys.readouterr() == ("", "")
     assert list(tmp_path.iterdir()) == []
     assert run.directory is None
     assert [row["iteration"] for row in run.metrics] == list(range(1, ITERATIONS + 1))
-    assert [row["episode_return"] for row in run.metrics] == [row["episode_return"] for row in timeless(finished)]
+    assert [row["episode_return"] for row in run.metrics] == [
+        row["episode_return"] for row in timeless(finished)
+    ]
     assert run.evaluation["episodes"] == 1
-    np.testing.assert_array_equal(run.policy(observations(5)), load_policy(finished)(observations(5)))
+    np.testing.assert_array_equal(
+        run.policy(observations(5)), load_policy(finished)(observations(5))
+    )
 
 
-def test_a_run_with_a_directory_is_that_of_the_command_line_and_goes_on_if_asked_to(finished, tmp_path):
+def test_a_run_with_a_directory_is_that_of_the_command_line_and_goes_on_if_asked_to(
+    finished, tmp_path
+):
     run_dir = tmp_path / "run"
     config = dataclasses.replace(small(), total_steps=small().total_steps // 2)
     assert train(config, run_dir, quiet=True, **CHOSEN).directory == run_dir
@@ -50,9 +58,14 @@ def test_a_run_with_a_directory_is_that_of_the_command_line_and_goes_on_if_asked
 
 def test_a_run_is_evaluated_where_asked_to_and_in_an_engine_of_ours_with_the_noise_of_the_training():
     config = dataclasses.replace(small(), noise=NoiseConfig(reward=100.0))
-    noisy, calm = (train(config, quiet=True, eval_engine=engine, **CHOSEN).evaluation for engine in ("native", "gymnasium"))
+    noisy, calm = (
+        train(config, quiet=True, eval_engine=engine, **CHOSEN).evaluation
+        for engine in ("native", "gymnasium")
+    )
     assert (noisy["engine"], calm["engine"]) == ("native", "gymnasium")
-    assert abs(noisy["return_mean"]) > 100 > calm["return_mean"] > 0  # of an episode of some ten steps, each with a reward of 1 or 2
+    assert (
+        abs(noisy["return_mean"]) > 100 > calm["return_mean"] > 0
+    )  # of an episode of some ten steps, each with a reward of 1 or 2
 
 
 @pytest.mark.parametrize(
@@ -60,14 +73,20 @@ def test_a_run_is_evaluated_where_asked_to_and_in_an_engine_of_ours_with_the_noi
     [
         (dataclasses.replace(small(), gamma=1.5), {}, "gamma 1.5: must be"),
         (small(), {"episodes": 0}, "episodes 0: must be"),
-        (small(), {"checkpoint_every": 5e4}, r"checkpoint_every 50000\.0: must be a whole number from 1 to"),
+        (
+            small(),
+            {"checkpoint_every": 5e4},
+            r"checkpoint_every 50000\.0: must be a whole number from 1 to",
+        ),
         (small(), {"episodes": "5"}, "episodes 5: must be a whole number"),
         (small(), {"eval_engine": "mujoco"}, "eval_engine mujoco: must be one of gymnasium, "),
         (small(), {"episode": 3}, "episode: must be one of cache_dir, "),
         (small(), {"resume": "x"}, "resume: must be one of cache_dir, "),
     ],
 )
-def test_an_invalid_setting_is_refused_before_anything_is_written(config, options, message, tmp_path, monkeypatch):
+def test_an_invalid_setting_is_refused_before_anything_is_written(
+    config, options, message, tmp_path, monkeypatch
+):
     monkeypatch.setattr(api.tempfile, "tempdir", str(tmp_path))
     with pytest.raises(ConfigError, match=message):
         train(config, **options)
@@ -109,7 +128,7 @@ def test_observations_of_another_size_are_refused(shape, finished):
 
 def test_a_policy_does_what_evaluations_play(finished, monkeypatch):
     config, seen = directory.read_config(finished), []
-    policies = restore.trained(finished, config, "newest").policy
+    policies = restore.trained(finished, config, "latest").policy
     greedy = jax.jit(make_greedy(make_task(config), config))
 
     def watched(policy, obs):
@@ -136,7 +155,9 @@ def test_of_seeds_trained_side_by_side_each_has_its_policy(tmp_path):
 
 
 def test_a_choice_that_does_not_exist_is_refused(finished, tmp_path):
-    with pytest.raises(ConfigError, match="last: must be one of newest, best"):
+    with pytest.raises(ConfigError, match="last: must be one of latest, best"):
         load_policy(finished, "last")
-    with pytest.raises(ConfigError, match=r"config\.json: must be a configuration that can be read"):
+    with pytest.raises(
+        ConfigError, match=r"config\.json: must be a configuration that can be read"
+    ):
         load_policy(tmp_path)

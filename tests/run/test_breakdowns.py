@@ -51,7 +51,9 @@ def test_a_signal_in_an_evaluation_breaks_it_off_and_the_run_goes_on_later_to_th
     assert resume(config, dataclasses.replace(QUIET, resume=run_dir)) == 0
     assert last(run_dir).read_bytes() == last(finished).read_bytes()
     assert timeless(run_dir) == timeless(finished)
-    assert (run_dir / "evaluations.jsonl").read_bytes() == (finished / "evaluations.jsonl").read_bytes()
+    assert (run_dir / "evaluations.jsonl").read_bytes() == (
+        finished / "evaluations.jsonl"
+    ).read_bytes()
 
 
 def test_a_directory_that_vanishes_while_it_trains_ends_the_run_in_one_line(tmp_path, capsys):
@@ -81,40 +83,77 @@ def no_file_larger_than(size):
         resource.setrlimit(resource.RLIMIT_FSIZE, usual)
 
 
-@pytest.mark.parametrize(("name", "share"), [("checkpoints/steps_000000000256.msgpack", 0.9), ("curve.png", 1.1)])
-def test_a_disk_that_takes_no_more_ends_the_run_in_one_line_and_it_goes_on_later_to_the_same_end(name, share, finished, tmp_path, capsys):
+@pytest.mark.parametrize(
+    ("name", "share"), [("checkpoints/steps_000000000256.msgpack", 0.9), ("curve.png", 1.1)]
+)
+def test_a_disk_that_takes_no_more_ends_the_run_in_one_line_and_it_goes_on_later_to_the_same_end(
+    name, share, finished, tmp_path, capsys
+):
     run_dir, size = tmp_path / "run", last(finished).stat().st_size
-    assert (finished / "metrics.jsonl").stat().st_size < 0.9 * size < 1.1 * size < (finished / "curve.png").stat().st_size
+    assert (
+        (finished / "metrics.jsonl").stat().st_size
+        < 0.9 * size
+        < 1.1 * size
+        < (finished / "curve.png").stat().st_size
+    )
     with no_file_larger_than(int(share * size)):
         assert train(small(), dataclasses.replace(QUIET, run_dir=run_dir)) == 1
-    left = f"continue from {last(run_dir).name} with --resume {run_dir}" if share > 1 else "there is no checkpoint"
-    assert capsys.readouterr().err == f"stopped: {run_dir}/{name}: cannot be written (File too large); {left}\n"
+    left = (
+        f"continue from {last(run_dir).name} with --resume {run_dir}"
+        if share > 1
+        else "there is no checkpoint"
+    )
+    assert (
+        capsys.readouterr().err
+        == f"stopped: {run_dir}/{name}: cannot be written (File too large); {left}\n"
+    )
     assert not list(run_dir.rglob("*.part"))
     assert resume(small(), dataclasses.replace(QUIET, resume=run_dir)) == 0
     assert last(run_dir).read_bytes() == last(finished).read_bytes()
     assert timeless(run_dir) == timeless(finished)
 
 
-def test_updates_that_are_not_finite_are_left_out_and_counted_and_end_the_run_when_there_is_no_other(tmp_path, capsys):
-    broken = dataclasses.replace(small(), policy=dataclasses.replace(SMALL.policy, learning_rate=1e30, max_grad_norm=1e30))
+def test_updates_that_are_not_finite_are_left_out_and_counted_and_end_the_run_when_there_is_no_other(
+    tmp_path, capsys
+):
+    broken = dataclasses.replace(
+        small(), policy=dataclasses.replace(SMALL.policy, learning_rate=1e30, max_grad_norm=1e30)
+    )
     options = dataclasses.replace(QUIET, run_dir=tmp_path / "run", max_nonfinite=3)
     assert train(broken, options) == 1
     assert "updates were not finite and were left out" in capsys.readouterr().err
     rows = metrics.read(tmp_path / "run" / "metrics.jsonl")
     assert sum(row["skipped"] for row in rows) >= 3
     state, _ = restore.training_state(tmp_path / "run", directory.read_config(tmp_path / "run"))
-    assert all(jnp.isfinite(x).all() for fit in (state.policy, state.critic) for x in fit.params["params"]["Dense_0"].values())
+    assert all(
+        jnp.isfinite(x).all()
+        for fit in (state.policy, state.critic)
+        for x in fit.params["params"]["Dense_0"].values()
+    )
     assert not (tmp_path / "run" / "evaluation.json").exists()
 
 
 def test_failures_in_a_row_are_seen_also_where_a_success_followed_before_anybody_looked():
-    skipped, nonfinite = np.array([[1, 0], [1, 0], [0, 0], [1, 0], [9, 9]]), np.array([[0, 0], [0, 33], [32, 33], [0, 0], [9, 9]])
+    skipped, nonfinite = (
+        np.array([[1, 0], [1, 0], [0, 0], [1, 0], [9, 9]]),
+        np.array([[0, 0], [0, 33], [32, 33], [0, 0], [9, 9]]),
+    )
     rows = training._failures(np.array([2, 0]), {"skipped": skipped, "nonfinite": nonfinite}, 4, 64)
-    assert rows.tolist() == [[3, 0], [4, 1], [0, 2], [1, 0]]  # half of the 64 steps is not most of them
+    assert rows.tolist() == [
+        [3, 0],
+        [4, 1],
+        [0, 2],
+        [1, 0],
+    ]  # half of the 64 steps is not most of them
 
 
-@pytest.mark.parametrize("reason", [MemoryError(), jax.errors.JaxRuntimeError("RESOURCE_EXHAUSTED: Out of memory.\nmore")])
-def test_an_allocation_that_fails_later_is_one_line_that_names_the_checkpoint_and_nothing_is_lost(reason, finished, tmp_path, capsys):
+@pytest.mark.parametrize(
+    "reason",
+    [MemoryError(), jax.errors.JaxRuntimeError("RESOURCE_EXHAUSTED: Out of memory.\nmore")],
+)
+def test_an_allocation_that_fails_later_is_one_line_that_names_the_checkpoint_and_nothing_is_lost(
+    reason, finished, tmp_path, capsys
+):
     run_dir, honest = tmp_path / "run", training.make_trainer
     counts = iter(range(99))
 
@@ -156,7 +195,9 @@ def test_a_state_that_is_not_finite_ends_the_run_in_one_line_and_is_not_saved(tm
 
     def save(record, state):
         if record.steps == 512:
-            state = state._replace(observations=jax.tree.map(lambda x: x * jnp.nan, state.observations))
+            state = state._replace(
+                observations=jax.tree.map(lambda x: x * jnp.nan, state.observations)
+            )
         honest(record, state)
 
     with pytest.MonkeyPatch.context() as patch:

@@ -53,12 +53,19 @@ def test_means_are_similar_where_target_and_prediction_differ_in_shape_alone():
     ("changes", "message"),
     [
         ({"algo": "ppo"}, "must be a run with a value distribution, not ppo"),
-        ({"algo": "dppo", "gamma": 0.99999}, "gamma 0.99999: must be at most 0.9999, so that returns can be followed to their end"),
+        (
+            {"algo": "dppo", "gamma": 0.99999},
+            "gamma 0.99999: must be at most 0.9999, so that returns can be followed to their end",
+        ),
     ],
 )
-def test_what_cannot_be_compared_is_refused_in_one_line(changes, message, tmp_path, monkeypatch, capsys):
+def test_what_cannot_be_compared_is_refused_in_one_line(
+    changes, message, tmp_path, monkeypatch, capsys
+):
     gamma = changes.pop("gamma", 0.99)
-    directory.create(tmp_path / "run", dataclasses.replace(runs.small(**changes), gamma=gamma), runs.QUIET)
+    directory.create(
+        tmp_path / "run", dataclasses.replace(runs.small(**changes), gamma=gamma), runs.QUIET
+    )
     monkeypatch.setattr("sys.argv", ["dgae calibrate", str(tmp_path / "run")])
     with pytest.raises(SystemExit, match="2"):
         helpers.command("calibrate")()
@@ -70,10 +77,15 @@ def test_what_cannot_be_compared_is_refused_in_one_line(changes, message, tmp_pa
     [
         ("x.pdf", "--out x.pdf: must be a file whose name ends in .png"),
         ("there/x.png", "--out there/x.png: must be a file in a directory that exists"),
-        ("taken.png", "--out taken.json: must be a file, not a directory, a link or a device"),  # where the statistics would go
+        (
+            "taken.png",
+            "--out taken.json: must be a file, not a directory, a link or a device",
+        ),  # where the statistics would go
     ],
 )
-def test_a_picture_that_cannot_be_written_is_refused_before_anything_is_played(out, message, tmp_path, monkeypatch, capsys):
+def test_a_picture_that_cannot_be_written_is_refused_before_anything_is_played(
+    out, message, tmp_path, monkeypatch, capsys
+):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "taken.json").mkdir()
     directory.create(tmp_path / "run", runs.small("dppo"), runs.QUIET)
@@ -86,34 +98,52 @@ def test_a_picture_that_cannot_be_written_is_refused_before_anything_is_played(o
 def test_the_critics_of_all_kinds_of_quantiles_can_be_compared(tmp_path):
     plain = runs.small("dppo")
     kinds = ("quantile", "sorted", "ordered")
-    made = {kind: dataclasses.replace(plain, critic=dataclasses.replace(plain.critic, kind=kind)) for kind in kinds}
+    made = {
+        kind: dataclasses.replace(plain, critic=dataclasses.replace(plain.critic, kind=kind))
+        for kind in kinds
+    }
     for name, config in made.items():
         directory.create(tmp_path / name, config, runs.QUIET)
     checked, _ = calibrate._checked(calibrate.Arguments(tuple(tmp_path / name for name in made)))
-    assert {path.name: config.critic.kind for path, config in checked.items()} == {name: name for name in made}
+    assert {path.name: config.critic.kind for path, config in checked.items()} == {
+        name: name for name in made
+    }
 
 
 def test_runs_of_the_same_name_are_refused(tmp_path, monkeypatch, capsys):
     for parent in ("a", "b"):
         directory.create(tmp_path / parent / "run", runs.small("dppo"), runs.QUIET)
-    monkeypatch.setattr("sys.argv", ["dgae calibrate", *(str(tmp_path / parent / "run") for parent in ("a", "b"))])
+    monkeypatch.setattr(
+        "sys.argv", ["dgae calibrate", *(str(tmp_path / parent / "run") for parent in ("a", "b"))]
+    )
     with pytest.raises(SystemExit, match="2"):
         helpers.command("calibrate")()
     assert "RUN_DIRS run run: must be of different names" in capsys.readouterr().err
 
 
 @pytest.mark.slow  # a program of its own is compiled
-def test_the_command_writes_the_statistics_of_every_run_and_a_picture(tmp_path, monkeypatch, capsys):
+def test_the_command_writes_the_statistics_of_every_run_and_a_picture(
+    tmp_path, monkeypatch, capsys
+):
     loop.start(runs.small("dppo"), dataclasses.replace(runs.QUIET, run_dir=tmp_path / "run"))
-    monkeypatch.setattr("sys.argv", ["dgae calibrate", str(tmp_path / "run"), "--cache-dir", runs.QUIET.cache_dir])
+    monkeypatch.setattr(
+        "sys.argv", ["dgae calibrate", str(tmp_path / "run"), "--cache-dir", runs.QUIET.cache_dir]
+    )
     assert helpers.command("calibrate")() == 0
     found = json.loads((tmp_path / "run" / "calibration.json").read_text())["run"]
-    assert found["samples"] == calibration.WORLDS * outcomes.CHUNK  # episodes of 20 steps, in whole chunks
-    assert np.isfinite([*found["pit"], found["rmse"], found["crps"], *found["similar_means"].values()]).all()
+    assert (
+        found["samples"] == calibration.WORLDS * outcomes.CHUNK
+    )  # episodes of 20 steps, in whole chunks
+    assert np.isfinite(
+        [*found["pit"], found["rmse"], found["crps"], *found["similar_means"].values()]
+    ).all()
     assert (tmp_path / "run" / "calibration.png").read_bytes().startswith(b"\x89PNG")
     assert "run: fewer than 10 quantiles have no central 90 %, " in capsys.readouterr().out
 
 
 def test_what_is_said_of_coverage_is_a_share_where_there_are_enough_quantiles():
     assert picture.held({"coverage_90": 0.874}) == "87 % of the returns in the central 90 %"
-    assert picture.held(calibration.statistics(UNIFORM[..., :9], RETURNS)) == "fewer than 10 quantiles have no central 90 %"
+    assert (
+        picture.held(calibration.statistics(UNIFORM[..., :9], RETURNS))
+        == "fewer than 10 quantiles have no central 90 %"
+    )

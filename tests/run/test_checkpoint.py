@@ -33,7 +33,10 @@ def test_a_checkpoint_gives_the_state_back_bit_for_bit(state, tmp_path):
         (lambda b: b"\xa3abc", "is damaged"),
         (lambda b: b"\x93\x01\xa1a\x02", "is damaged"),
         (lambda b: b[:-9] + b"x" + b[-8:], "is damaged"),
-        (lambda b: b.replace(b'"schema": 3', b'"schema": 4'), "has schema 4, of a newer version; this version reads schema 3"),
+        (
+            lambda b: b.replace(b'"schema": 3', b'"schema": 4'),
+            "has schema 4, of a newer version; this version reads schema 3",
+        ),
         (
             lambda b: b.replace(b'"schema": 3', b'"schema": 2'),
             "has schema 2, this version reads schema 3: its worlds drew random numbers in another way; continue it with the version that "
@@ -44,7 +47,10 @@ def test_a_checkpoint_gives_the_state_back_bit_for_bit(state, tmp_path):
             "has schema 1, this version reads schema 3: what it calls physics mjx is now called jax; continue it with the version that "
             "wrote it, or train again",
         ),
-        (lambda b: signed(b.partition(b"\n")[2].replace(b"critic.", b"cretic.")), "is of another run, cretic.* is unknown here"),
+        (
+            lambda b: signed(b.partition(b"\n")[2].replace(b"critic.", b"cretic.")),
+            "is of another run, cretic.* is unknown here",
+        ),
         (lambda b: b.replace(b'"schema": 3', b'"schema": 1e999'), "is damaged"),
         (lambda b: b.replace(b'"schema": 3', b'"schema": true'), "is damaged"),
         (lambda b: signed(b"\x93\x01\xa1a\x02"), "is damaged"),
@@ -58,11 +64,15 @@ def test_a_damaged_checkpoint_is_refused_by_name(damage, reason, state, tmp_path
         checkpoint.load(path, state)
 
 
-def test_arrays_of_other_shapes_are_refused_by_name_whatever_configuration_they_claim(state, tmp_path):
+def test_arrays_of_other_shapes_are_refused_by_name_whatever_configuration_they_claim(
+    state, tmp_path
+):
     arrays = checkpoint.arrays_of(state)
     name = next(name for name in arrays if name.startswith("policy.params"))
     path = checkpoint.save(tmp_path, SMALL, {**arrays, name: np.zeros((2, 2), np.float16)}, 0)
-    with pytest.raises(CheckpointError, match=rf"is of another run, {name} is float16\(2, 2\), here float32\(1, "):
+    with pytest.raises(
+        CheckpointError, match=rf"is of another run, {name} is float16\(2, 2\), here float32\(1, "
+    ):
         checkpoint.load(path, state)
 
 
@@ -82,7 +92,10 @@ def array(shape=(2,), dtype="float32", data=bytes(8)):
 @pytest.mark.parametrize(
     ("value", "reason"),
     [
-        (["x" * 100_000, *[""] * 15_000], "is damaged"),  # np.asarray makes 15,001 × 100,000 characters of 4 bytes of it: 6 GB
+        (
+            ["x" * 100_000, *[""] * 15_000],
+            "is damaged",
+        ),  # np.asarray makes 15,001 × 100,000 characters of 4 bytes of it: 6 GB
         ([[[]] * 50_000], "is damaged"),
         ({"a": 1}, "is damaged"),
         ("x", "is damaged"),
@@ -102,7 +115,10 @@ def array(shape=(2,), dtype="float32", data=bytes(8)):
     ],
 )
 def test_what_is_not_the_expected_array_is_refused_before_it_takes_memory(value, reason, tmp_path):
-    data, like = signed(msgpack.packb({"arrays": {"a": value}, "config": "{}"})), {"a": np.zeros(2, np.float32)}
+    data, like = (
+        signed(msgpack.packb({"arrays": {"a": value}, "config": "{}"})),
+        {"a": np.zeros(2, np.float32)},
+    )
     path = tmp_path / "steps_000000000000.msgpack"
     path.write_bytes(data)
     tracemalloc.start()
@@ -116,7 +132,11 @@ def test_what_is_not_the_expected_array_is_refused_before_it_takes_memory(value,
 
 
 def test_a_part_of_a_checkpoint_is_loaded_without_a_look_at_the_rest(tmp_path):
-    arrays = {"a": np.ones(2, np.float32), "b": np.full(3, np.nan), "c": np.arange(3, dtype=np.int32)}
+    arrays = {
+        "a": np.ones(2, np.float32),
+        "b": np.full(3, np.nan),
+        "c": np.arange(3, dtype=np.int32),
+    }
     path = checkpoint.save(tmp_path, SMALL, {**arrays, "b": np.ones(3)}, 0)
     body = path.read_bytes().partition(b"\n")[2]
     path.write_bytes(signed(body.replace(np.ones(3).tobytes(), arrays["b"].tobytes())))
@@ -131,13 +151,26 @@ def test_a_part_of_a_checkpoint_is_loaded_without_a_look_at_the_rest(tmp_path):
 def broken(state, where, value):
     """The state with one number replaced."""
     leaves, tree = jax.tree.flatten(state)
-    at = next(i for i, (path, _) in enumerate(jax.tree.leaves_with_path(state)) if checkpoint._name(path).startswith(where))
+    at = next(
+        i
+        for i, (path, _) in enumerate(jax.tree.leaves_with_path(state))
+        if checkpoint._name(path).startswith(where)
+    )
     leaves[at] = leaves[at].at[(0,) * leaves[at].ndim].set(value)
     return jax.tree.unflatten(tree, leaves)
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf])
-@pytest.mark.parametrize("where", ["policy.params", "policy.opt_state.1.0.mu", "critic.params", "observations.mean", "observations.std"])
+@pytest.mark.parametrize(
+    "where",
+    [
+        "policy.params",
+        "policy.opt_state.1.0.mu",
+        "critic.params",
+        "observations.mean",
+        "observations.std",
+    ],
+)
 def test_a_state_that_is_not_finite_is_neither_saved_nor_loaded(where, value, state, tmp_path):
     with pytest.raises(NotFiniteError, match=rf"^{where}\S* is not finite after 64 samples"):
         saved(broken(state, where, value), tmp_path, 64)
@@ -145,7 +178,10 @@ def test_a_state_that_is_not_finite_is_neither_saved_nor_loaded(where, value, st
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(checkpoint, "not_finite", lambda arrays: [])
         path = saved(broken(state, where, value), tmp_path, 64)
-    with pytest.raises(NotFiniteError, match=rf"{path.name}: {where}\S* is not finite: it can be neither continued nor evaluated"):
+    with pytest.raises(
+        NotFiniteError,
+        match=rf"{path.name}: {where}\S* is not finite: it can be neither continued nor evaluated",
+    ):
         checkpoint.load(path, state)
 
 

@@ -38,7 +38,10 @@ def test_a_long_run_is_drawn_from_its_first_to_its_last_iteration_in_a_thousand_
     np.testing.assert_array_equal(y, np.sqrt(x))
 
 
-@pytest.mark.parametrize(("seeds", "labels"), [(1, ["training"]), (3, ["training, mean of 3 seeds", "± 1 standard deviation of seeds"])])
+@pytest.mark.parametrize(
+    ("seeds", "labels"),
+    [(1, ["training"]), (3, ["training, mean of 3 seeds", "± 1 standard deviation of seeds"])],
+)
 def test_the_legend_names_every_line(seeds, labels):
     figure = curve.learning_curve(np.arange(5), np.ones((5, seeds)), "title", np.ones((2, 3)))
     texts = [text.get_text() for text in figure.axes[0].get_legend().get_texts()]

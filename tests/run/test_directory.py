@@ -58,7 +58,9 @@ def test_a_config_file_with_an_impossible_value_is_refused(tmp_path):
         directory.read_config(tmp_path)
 
 
-def test_a_directory_in_use_is_refused_and_left_alone_also_while_its_configuration_is_rewritten(run_dir):
+def test_a_directory_in_use_is_refused_and_left_alone_also_while_its_configuration_is_rewritten(
+    run_dir,
+):
     with directory.locked(run_dir):
         directory.write_config(run_dir, directory.read_config(run_dir))
         with pytest.raises(ConfigError, match="another process is training there"):
@@ -81,21 +83,37 @@ def without_rights(directory):
 
 
 def test_a_directory_that_cannot_be_written_is_one_clear_line(run_dir):
-    with without_rights(run_dir), pytest.raises(ConfigError, match=r"must be a directory that can be written.*Permission denied"):
+    with (
+        without_rights(run_dir),
+        pytest.raises(
+            ConfigError, match=r"must be a directory that can be written.*Permission denied"
+        ),
+    ):
         train(small(), dataclasses.replace(QUIET, run_dir=run_dir / "below"))
     with without_rights(run_dir), pytest.raises(ConfigError, match="Permission denied"):
         resume(small(), dataclasses.replace(QUIET, resume=run_dir))
 
 
-PARTS = ["config.json", "metrics.jsonl", "evaluations.jsonl", "checkpoints", "checkpoints/steps_000000000256.msgpack"]
+PARTS = [
+    "config.json",
+    "metrics.jsonl",
+    "evaluations.jsonl",
+    "checkpoints",
+    "checkpoints/steps_000000000256.msgpack",
+]
 
 
 @pytest.mark.parametrize("name", PARTS)
-def test_a_run_directory_with_a_link_in_it_is_refused_and_nothing_is_touched(name, run_dir, tmp_path):
+def test_a_run_directory_with_a_link_in_it_is_refused_and_nothing_is_touched(
+    name, run_dir, tmp_path
+):
     (run_dir / name).rename(tmp_path / "outside")
     (run_dir / name).symlink_to(tmp_path / "outside")
     before = sorted((p, p.lstat().st_mtime_ns) for p in tmp_path.rglob("*"))
-    with pytest.raises(ConfigError, match=rf"run/{name}: must be a (file|directory) in the run directory itself, not a link"):
+    with pytest.raises(
+        ConfigError,
+        match=rf"run/{name}: must be a (file|directory) in the run directory itself, not a link",
+    ):
         resume(directory.read_config(run_dir), dataclasses.replace(QUIET, resume=run_dir))
     assert sorted((p, p.lstat().st_mtime_ns) for p in tmp_path.rglob("*")) == before
 
@@ -107,7 +125,9 @@ def test_a_pipe_in_place_of_a_file_is_refused_and_does_not_hang(run_dir):
         directory.read_config(run_dir)
 
 
-@pytest.mark.parametrize("name", ["curve.png", "curve.png.part", "evaluation.json", "manifest.json.part"])
+@pytest.mark.parametrize(
+    "name", ["curve.png", "curve.png.part", "evaluation.json", "manifest.json.part"]
+)
 def test_links_where_whole_files_are_written_are_replaced_and_not_followed(name, run_dir, tmp_path):
     (tmp_path / "outside").write_text("mine")
     (run_dir / name).unlink(missing_ok=True)
@@ -174,14 +194,21 @@ for left in parent.iterdir():
 
 
 def test_a_process_killed_at_any_step_leaves_a_directory_that_can_be_started_or_resumed(tmp_path):
-    done = subprocess.run([sys.executable, "-W", "ignore", "-c", KILLED_ANYWHERE, tmp_path], cwd=ROOT, capture_output=True, text=True)
+    done = subprocess.run(
+        [sys.executable, "-W", "ignore", "-c", KILLED_ANYWHERE, tmp_path],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+    )
     assert done.stderr == ""
     beside, inside = (int(line.split()[1]) for line in done.stdout.splitlines())
     assert min(beside, inside) >= 6  # steps at which it was killed
 
 
 @pytest.mark.parametrize("exists", [False, True])
-def test_a_disk_that_is_full_at_once_is_refused_and_leaves_nothing_that_is_in_the_way(exists, tmp_path, monkeypatch):
+def test_a_disk_that_is_full_at_once_is_refused_and_leaves_nothing_that_is_in_the_way(
+    exists, tmp_path, monkeypatch
+):
     run_dir = tmp_path / "run"
     if exists:
         run_dir.mkdir()
@@ -191,7 +218,9 @@ def test_a_disk_that_is_full_at_once_is_refused_and_leaves_nothing_that_is_in_th
 
     with monkeypatch.context() as patch:
         patch.setattr(os, "fsync", full)
-        with pytest.raises(ConfigError, match=r"must be a directory that can be written \(No space left"):
+        with pytest.raises(
+            ConfigError, match=r"must be a directory that can be written \(No space left"
+        ):
             directory.create(run_dir, SMALL, RunOptions())
     assert [p.name for p in tmp_path.iterdir()] == (["run"] if exists else [])
     directory.create(run_dir, SMALL, RunOptions())
@@ -199,12 +228,18 @@ def test_a_disk_that_is_full_at_once_is_refused_and_leaves_nothing_that_is_in_th
 
 
 def test_the_attempt_of_a_process_that_is_alive_is_left_alone_and_a_dead_ones_is_removed(tmp_path):
-    alive, dead, other = (tmp_path / f".{name}.part" for name in ("run.alive", "run.dead", "runs.x"))
+    alive, dead, other = (
+        tmp_path / f".{name}.part" for name in ("run.alive", "run.dead", "runs.x")
+    )
     for each in (alive, dead, other):
         (each / "checkpoints").mkdir(parents=True)
     with directory._held(alive):
         directory.create(tmp_path / "run", SMALL, RunOptions())
-        assert sorted(p.name for p in tmp_path.iterdir()) == [".run.alive.part", ".runs.x.part", "run"]
+        assert sorted(p.name for p in tmp_path.iterdir()) == [
+            ".run.alive.part",
+            ".runs.x.part",
+            "run",
+        ]
 
 
 def test_of_two_that_begin_at_once_one_is_refused(tmp_path, monkeypatch):

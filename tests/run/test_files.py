@@ -14,8 +14,14 @@ from dgae_jax.run import files
 
 def test_a_file_and_then_the_directory_that_names_it_are_synced(tmp_path, monkeypatch):
     order, sync, rename = [], os.fsync, Path.replace
-    monkeypatch.setattr(os, "fsync", lambda fd: order.append(str(Path(f"/proc/self/fd/{fd}").readlink())) or sync(fd))
-    monkeypatch.setattr(Path, "replace", lambda part, to: order.append("rename") or rename(part, to))
+    monkeypatch.setattr(
+        os,
+        "fsync",
+        lambda fd: order.append(str(Path(f"/proc/self/fd/{fd}").readlink())) or sync(fd),
+    )
+    monkeypatch.setattr(
+        Path, "replace", lambda part, to: order.append("rename") or rename(part, to)
+    )
     files.replace(tmp_path / "a", b"x")
     assert order == [str(tmp_path / "a.part"), "rename", str(tmp_path)]
 
@@ -36,11 +42,21 @@ def test_a_file_that_cannot_be_finished_leaves_what_was_there(step, tmp_path, mo
 
 
 def test_numbers_that_are_not_finite_are_null_in_json_however_deep(tmp_path):
-    data = {"a": float("nan"), "b": [1.5, float("inf"), {"c": (-float("inf"), np.float64("nan"))}], "d": "NaN", "e": 1}
+    data = {
+        "a": float("nan"),
+        "b": [1.5, float("inf"), {"c": (-float("inf"), np.float64("nan"))}],
+        "d": "NaN",
+        "e": 1,
+    }
     files.write_json(tmp_path / "a.json", data)
     files.append_rows(tmp_path / "a.jsonl", [data])
     for name in ("a.json", "a.jsonl"):
-        assert json.loads((tmp_path / name).read_text()) == {"a": None, "b": [1.5, None, {"c": [None, None]}], "d": "NaN", "e": 1}
+        assert json.loads((tmp_path / name).read_text()) == {
+            "a": None,
+            "b": [1.5, None, {"c": [None, None]}],
+            "d": "NaN",
+            "e": 1,
+        }
 
 
 def test_of_several_that_write_in_a_directory_each_has_its_turn(tmp_path):

@@ -29,7 +29,10 @@ def pair(*flags):
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         where = f"127.0.0.1:{free.getsockname()[1]}"
-    return [begun("--coordinator", where, "--num-processes", 2, "--process-id", i, *flags) for i in range(2)]
+    return [
+        begun("--coordinator", where, "--num-processes", 2, "--process-id", i, *flags)
+        for i in range(2)
+    ]
 
 
 def finished(processes):
@@ -57,7 +60,10 @@ def test_two_processes_find_what_one_finds_with_two_devices(whole, tmp_path):
     ours, theirs = arrays(whole), arrays(tmp_path / "one")
     for name, x in theirs.items():
         np.testing.assert_allclose(ours[name], x, atol=1e-5, err_msg=name)
-    returns = [json.loads((d / "evaluation.json").read_text())["returns"] for d in (whole, tmp_path / "one")]
+    returns = [
+        json.loads((d / "evaluation.json").read_text())["returns"]
+        for d in (whole, tmp_path / "one")
+    ]
     np.testing.assert_allclose(*returns, rtol=1e-5)
 
 
@@ -74,13 +80,18 @@ def test_a_run_of_two_processes_goes_on_bit_for_bit(whole, tmp_path):
 def test_devices_of_all_processes_must_come_out_even(tmp_path):
     for _, err, code in finished(pair(*FLAGS, "--devices", "3", "--run-dir", tmp_path / "run")):
         assert code == 2
-        assert "error: --devices 3: must be a number that divides num_envs 4 or num_seeds 1 in each of 2 processes\n" in err
+        assert (
+            "error: --devices 3: must be a number that divides num_envs 4 or num_seeds 1 in each of 2 processes\n"
+            in err
+        )
 
 
 def test_a_signal_to_any_of_them_stops_all_with_one_checkpoint(tmp_path):
     run_dir = tmp_path / "run"
     processes = pair(*TINY, "--total-steps", "100_000_000", "--run-dir", run_dir)
-    while not (run_dir / "metrics.jsonl").exists() or not (run_dir / "metrics.jsonl").stat().st_size:
+    while (
+        not (run_dir / "metrics.jsonl").exists() or not (run_dir / "metrics.jsonl").stat().st_size
+    ):
         time.sleep(0.2)
         assert all(process.poll() is None for process in processes), finished(processes)
     processes[1].send_signal(signal.SIGTERM)
@@ -95,8 +106,14 @@ def test_a_signal_to_any_of_them_stops_all_with_one_checkpoint(tmp_path):
     ("flags", "reason"),
     [
         (("--coordinator", "here"), "--coordinator here: must be HOST:PORT"),
-        (("--coordinator", "localhost:1", "--num-processes", "2"), "--process-id None: must be given with --coordinator"),
-        (("--coordinator", "localhost:1", "--num-processes", "2", "--process-id", "2"), "--process-id 2: must be below --num-processes 2"),
+        (
+            ("--coordinator", "localhost:1", "--num-processes", "2"),
+            "--process-id None: must be given with --coordinator",
+        ),
+        (
+            ("--coordinator", "localhost:1", "--num-processes", "2", "--process-id", "2"),
+            "--process-id 2: must be below --num-processes 2",
+        ),
         (("--num-processes", "2"), "--num-processes 2: must be left out without --coordinator"),
         (("--process-id", "0"), "--process-id 0: must be left out without --coordinator"),
     ],
@@ -106,7 +123,13 @@ def test_what_does_not_name_a_meeting_is_refused_in_one_line(flags, reason, tmp_
     assert (code, err) == (2, f"error: {reason}\n")
 
 
-SCHEDULERS = ("SLURM_NTASKS", "OMPI_COMM_WORLD_SIZE", "TPU_WORKER_HOSTNAMES", "KUBERNETES_SERVICE_HOST", "JOB_COMPLETION_INDEX")
+SCHEDULERS = (
+    "SLURM_NTASKS",
+    "OMPI_COMM_WORLD_SIZE",
+    "TPU_WORKER_HOSTNAMES",
+    "KUBERNETES_SERVICE_HOST",
+    "JOB_COMPLETION_INDEX",
+)
 
 
 @pytest.mark.parametrize(
@@ -122,7 +145,9 @@ SCHEDULERS = ("SLURM_NTASKS", "OMPI_COMM_WORLD_SIZE", "TPU_WORKER_HOSTNAMES", "K
         ({"KUBERNETES_SERVICE_HOST": "here", "JOB_COMPLETION_INDEX": "0"}, True),
     ],
 )
-def test_processes_are_expected_where_a_scheduler_started_several(environment, several, monkeypatch):
+def test_processes_are_expected_where_a_scheduler_started_several(
+    environment, several, monkeypatch
+):
     for name in SCHEDULERS:
         monkeypatch.delenv(name, raising=False)
     for name, value in environment.items():

@@ -9,9 +9,12 @@ from dgae_jax.run import metrics
 
 
 def test_metrics_are_one_json_object_per_run_and_iteration(tmp_path):
-    config = dg.Config(seed=7, num_seeds=2, num_envs=10, horizon=10)
+    config = dg.Config(seed=7, num_seeds=2, num_envs=10, num_steps=10)
     file = metrics.MetricsFile(tmp_path / "metrics.jsonl", config, 0)
-    columns = {"episode_return": np.array([[1.5, np.nan], [2.0, 3.0], [0, 0]]), "episodes": np.array([[0, 1], [2, 3], [0, 0]])}
+    columns = {
+        "episode_return": np.array([[1.5, np.nan], [2.0, 3.0], [0, 0]]),
+        "episodes": np.array([[0, 1], [2, 3], [0, 0]]),
+    }
     file.append(columns, 2, 1.0)
     file.append(columns, 1, 2.0)
     rows = metrics.read(tmp_path / "metrics.jsonl")
@@ -22,7 +25,7 @@ def test_metrics_are_one_json_object_per_run_and_iteration(tmp_path):
 
 
 def test_metrics_continue_behind_the_checkpoint_whatever_followed_it(tmp_path):
-    config, path = dg.Config(num_envs=10, horizon=10), tmp_path / "metrics.jsonl"
+    config, path = dg.Config(num_envs=10, num_steps=10), tmp_path / "metrics.jsonl"
     columns = {"episode_return": np.arange(8.0)[:, None]}
     metrics.MetricsFile(path, config, 0).append(columns, 8, 1.5)
     path.write_text(path.read_text() + '{"iteration": 9, "st')  # torn

@@ -5,8 +5,8 @@ import re
 
 import pytest
 
-from dgae_jax.configs.algorithms import TABLE
-from dgae_jax.configs.config import resolve
+from dgae_jax.configs.algorithms import ALGORITHMS
+from dgae_jax.configs.resolved import resolve
 from dgae_jax.run import metrics
 from dgae_jax.run.loop import train
 from tests.helpers import ROOT
@@ -26,16 +26,27 @@ METRICS, EVALUATIONS = table("metrics.jsonl"), table("evaluations.jsonl")
 
 
 @pytest.fixture(
-    scope="module", params=[name if name in ("dppo", "dtrpo", "a2c") else pytest.param(name, marks=pytest.mark.slow) for name in TABLE]
+    scope="module",
+    params=[
+        name if name in ("dppo", "dtrpo", "a2c") else pytest.param(name, marks=pytest.mark.slow)
+        for name in ALGORITHMS
+    ],
 )
 def run(request, tmp_path_factory):
     """The configuration of a tiny run with all that it can say, its metrics and its evaluations."""
     config = small(request.param)
-    shape = {"total_steps": 2 * config.samples_per_iteration, "diagnostics": config.critic.kind == "quantile"}
+    shape = {
+        "total_steps": 2 * config.samples_per_iteration,
+        "diagnostics": config.critic.kind == "quantile",
+    }
     config = resolve(dataclasses.replace(config, **shape))
     run_dir = tmp_path_factory.mktemp("runs") / "run"
     assert train(config, dataclasses.replace(QUIET, run_dir=run_dir)) == 0
-    return config, metrics.read(run_dir / "metrics.jsonl"), metrics.read(run_dir / "evaluations.jsonl")
+    return (
+        config,
+        metrics.read(run_dir / "metrics.jsonl"),
+        metrics.read(run_dir / "evaluations.jsonl"),
+    )
 
 
 def test_the_document_names_exactly_the_metrics_of_each_algorithm(run):
@@ -43,7 +54,9 @@ def test_the_document_names_exactly_the_metrics_of_each_algorithm(run):
     kinds = {"all", config.policy.update} | ({"diagnostics"} if config.diagnostics else set())
     assert rows
     for row in rows:
-        assert set(row) == {name for name, (where, *_) in METRICS.items() if kinds & set(where.split(", "))}
+        assert set(row) == {
+            name for name, (where, *_) in METRICS.items() if kinds & set(where.split(", "))
+        }
 
 
 def test_the_document_names_exactly_the_numbers_of_an_evaluation(run):
@@ -54,7 +67,7 @@ def test_the_document_names_exactly_the_numbers_of_an_evaluation(run):
 
 
 def test_every_metric_is_in_some_algorithm_and_has_a_unit_a_meaning_and_what_is_healthy():
-    known = {"all", "diagnostics", *(row.policy_update for row in TABLE.values())}
+    known = {"all", "diagnostics", *(row.policy_update for row in ALGORITHMS.values())}
     for name, (where, *said) in METRICS.items():
         assert set(where.split(", ")) <= known, name
         assert len(said) == 3, name

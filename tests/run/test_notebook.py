@@ -34,7 +34,9 @@ class Cell:
     def display(self, data, *, raw, metadata, display_id):
         assert (raw, display_id) == (True, True)
         self.history.append((data, metadata))
-        return SimpleNamespace(update=lambda data, *, raw, metadata: self.history.append((data, metadata)))
+        return SimpleNamespace(
+            update=lambda data, *, raw, metadata: self.history.append((data, metadata))
+        )
 
 
 @pytest.fixture
@@ -52,9 +54,13 @@ def test_a_kernel_that_may_speak_has_a_page_and_nothing_else_has(cell, monkeypat
     assert notebook.is_there()
     with terminal.silenced():
         assert not notebook.is_there()
-    monkeypatch.setattr(sys.modules["IPython"], "get_ipython", lambda: SimpleNamespace())  # IPython on a terminal
+    monkeypatch.setattr(
+        sys.modules["IPython"], "get_ipython", lambda: SimpleNamespace()
+    )  # IPython on a terminal
     assert not notebook.is_there()
-    monkeypatch.setattr(sys.modules["IPython"], "get_ipython", lambda: None)  # imported by a program
+    monkeypatch.setattr(
+        sys.modules["IPython"], "get_ipython", lambda: None
+    )  # imported by a program
     assert not notebook.is_there()
     monkeypatch.delitem(sys.modules, "IPython")
     assert not notebook.is_there()
@@ -62,7 +68,9 @@ def test_a_kernel_that_may_speak_has_a_page_and_nothing_else_has(cell, monkeypat
 
 
 def test_one_output_has_words_until_there_is_a_return_and_then_the_curve(cell, capsys):
-    figures = iter([None, *(curve.learning_curve(np.arange(3), np.ones((3, 1)), "a run") for _ in range(2))])
+    figures = iter(
+        [None, *(curve.learning_curve(np.arange(3), np.ones((3, 1)), "a run") for _ in range(2))]
+    )
     with Reporter(100, page=Page(lambda: next(figures))) as reporter:
         reporter.announce("compiling")
         reporter.announce("10 of 100 steps")
@@ -109,5 +117,8 @@ def test_a_run_in_a_real_kernel_leaves_one_picture_and_a_quiet_one_nothing(monke
     budget, picture = book.cells[0].outputs
     assert budget["text"].startswith("loud\nhopper-v4 ppo on native: ")
     assert budget["text"].count("\n") == 2
-    assert (picture["output_type"], sorted(picture["data"])) == ("display_data", ["image/png", "text/plain"])
+    assert (picture["output_type"], sorted(picture["data"])) == (
+        "display_data",
+        ["image/png", "text/plain"],
+    )
     assert imread(io.BytesIO(base64.b64decode(picture["data"]["image/png"]))).shape == (600, 960, 4)

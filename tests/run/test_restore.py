@@ -23,10 +23,14 @@ def test_the_newest_checkpoints_are_kept_and_the_best(state, tmp_path):
     directory.mkdir()
     for steps in (64, 128, 6400, 9600):
         saved(state, directory, steps, keep=2, best=64)
-    assert [p.name for p in checkpoint.found(directory)] == [f"steps_{steps:012d}.msgpack" for steps in (64, 6400, 9600)]
+    assert [p.name for p in checkpoint.found(directory)] == [
+        f"steps_{steps:012d}.msgpack" for steps in (64, 6400, 9600)
+    ]
     assert restore.training_state(tmp_path, SMALL)[1].name == "steps_000000009600.msgpack"
     saved(state, directory, 12800, keep=2, best=9600)
-    assert [p.name for p in checkpoint.found(directory)] == [f"steps_{steps:012d}.msgpack" for steps in (9600, 12800)]
+    assert [p.name for p in checkpoint.found(directory)] == [
+        f"steps_{steps:012d}.msgpack" for steps in (9600, 12800)
+    ]
 
 
 @pytest.mark.parametrize(
@@ -34,10 +38,15 @@ def test_the_newest_checkpoints_are_kept_and_the_best(state, tmp_path):
     [
         ({"env_version": "v5"}, r"its env_version is v4, here v5"),  # arrays of the same shapes
         ({"env": "ant"}, r"its env is hopper, here ant"),
-        ({"policy": dataclasses.replace(SMALL.policy, hidden=(9,))}, r"its policy\.hidden is \(8,\), here \(9,\)"),
+        (
+            {"policy": dataclasses.replace(SMALL.policy, hidden=(9,))},
+            r"its policy\.hidden is \(8,\), here \(9,\)",
+        ),
     ],
 )
-def test_a_checkpoint_of_another_environment_or_network_is_refused_by_both_values(change, reason, state, tmp_path):
+def test_a_checkpoint_of_another_environment_or_network_is_refused_by_both_values(
+    change, reason, state, tmp_path
+):
     path = saved(state, tmp_path, 64)
     with pytest.raises(CheckpointError, match=f"{path.name}: is of another run, {reason}"):
         restore.load_state(path, dataclasses.replace(SMALL, **change))
@@ -62,7 +71,9 @@ def test_a_directory_without_checkpoints_is_refused(tmp_path):
         restore.training_state(tmp_path, SMALL)
 
 
-def test_a_damaged_checkpoint_gives_way_to_an_older_one_and_links_are_not_followed(state, tmp_path, capsys):
+def test_a_damaged_checkpoint_gives_way_to_an_older_one_and_links_are_not_followed(
+    state, tmp_path, capsys
+):
     directory = tmp_path / "checkpoints"
     directory.mkdir()
     whole, broken = (saved(state, directory, steps) for steps in (64, 128))
@@ -70,7 +81,7 @@ def test_a_damaged_checkpoint_gives_way_to_an_older_one_and_links_are_not_follow
     (directory / "steps_000000000192.msgpack").symlink_to(whole)
     _, path = restore.training_state(tmp_path, SMALL)
     assert path == whole
-    warning = f"warning: {broken}: is damaged (its checksum differs); falling back to {whole.name}\n"
+    warning = f"warning: {broken}: is damaged (its checksum differs); linear_schedule back to {whole.name}\n"
     assert capsys.readouterr().err == warning
     whole.unlink()
     with pytest.raises(CheckpointError, match="its checksum differs"):
@@ -90,16 +101,29 @@ def test_the_best_checkpoint_stays_and_can_be_evaluated(tmp_path):
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(record_module, "evaluate_policies", scored)
         assert train(config, options) == 0
-    assert [p.name for p in checkpoint.found(run_dir / "checkpoints")] == [f"steps_{steps:012d}.msgpack" for steps in (256, 512)]
+    assert [p.name for p in checkpoint.found(run_dir / "checkpoints")] == [
+        f"steps_{steps:012d}.msgpack" for steps in (256, 512)
+    ]
     config = directory.read_config(run_dir)
-    found = {which: evaluate_run(run_dir, config, which=which, engine="gymnasium", episodes=1) for which in ("best", "newest")}
-    assert [found[which]["checkpoint"] for which in ("best", "newest")] == ["steps_000000000256.msgpack", "steps_000000000512.msgpack"]
-    assert found["newest"]["returns"] == json.loads((run_dir / "evaluation.json").read_text())["returns"]
+    found = {
+        which: evaluate_run(run_dir, config, which=which, engine="gymnasium", episodes=1)
+        for which in ("best", "latest")
+    }
+    assert [found[which]["checkpoint"] for which in ("best", "latest")] == [
+        "steps_000000000256.msgpack",
+        "steps_000000000512.msgpack",
+    ]
+    assert (
+        found["latest"]["returns"]
+        == json.loads((run_dir / "evaluation.json").read_text())["returns"]
+    )
 
 
 def test_the_best_checkpoint_of_a_run_without_evaluations_is_refused(run_dir):
     (run_dir / "evaluations.jsonl").unlink()
-    with pytest.raises(ConfigError, match=r"checkpoint best: must be newest: .* has no evaluations"):
+    with pytest.raises(
+        ConfigError, match=r"checkpoint best: must be latest: .* has no evaluations"
+    ):
         evaluate_run(run_dir, small(), which="best", engine="gymnasium", episodes=1)
 
 
@@ -109,20 +133,31 @@ def test_a_run_whose_newest_checkpoint_is_not_finite_is_neither_resumed_nor_eval
     params = jax.tree.map(lambda x: x * np.nan, state.policy.params)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(checkpoint, "not_finite", lambda arrays: [])
-        checkpoint.save(path.parent, config, checkpoint.arrays_of(state._replace(policy=state.policy._replace(params=params))), 512)
+        checkpoint.save(
+            path.parent,
+            config,
+            checkpoint.arrays_of(state._replace(policy=state.policy._replace(params=params))),
+            512,
+        )
     reason = rf"{path.name}: policy\.params\.\S+ is not finite: it can be neither continued nor evaluated"
     with pytest.raises(CheckpointError, match=reason):
         resume(small(), dataclasses.replace(QUIET, resume=run_dir))
     with pytest.raises(CheckpointError, match=reason):
-        evaluate_run(run_dir, config, which="newest", episodes=1)
+        evaluate_run(run_dir, config, which="latest", episodes=1)
 
 
-def test_acting_takes_the_networks_and_the_statistics_of_a_checkpoint_and_nothing_else(state, tmp_path):
+def test_acting_takes_the_networks_and_the_statistics_of_a_checkpoint_and_nothing_else(
+    state, tmp_path
+):
     arrays = checkpoint.arrays_of(state)
-    rest = {name: np.zeros(3) for name in arrays if not name.startswith(("policy.params", "critic.params", "observations"))}
+    rest = {
+        name: np.zeros(3)
+        for name in arrays
+        if not name.startswith(("policy.params", "critic.params", "observations"))
+    }
     (tmp_path / "checkpoints").mkdir()
     checkpoint.save(tmp_path / "checkpoints", SMALL, {**arrays, **rest}, 64)
-    found = restore.trained(tmp_path, SMALL, "newest")
+    found = restore.trained(tmp_path, SMALL, "latest")
     chex.assert_trees_all_equal(found.policy.params, state.policy.params)
     chex.assert_trees_all_equal(found.critic.params, state.critic.params)
     with pytest.raises(CheckpointError, match="is of another run"):

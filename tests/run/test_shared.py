@@ -15,9 +15,21 @@ def train(*flags):
     return subprocess.run(command, capture_output=True, text=True, check=False)
 
 
-def test_a_shared_run_that_stopped_half_way_ends_with_the_same_bits_on_as_many_devices_and_is_refused_on_others(tmp_path):
+def test_a_shared_run_that_stopped_half_way_ends_with_the_same_bits_on_as_many_devices_and_is_refused_on_others(
+    tmp_path,
+):
     whole, half = tmp_path / "whole", tmp_path / "half"
-    flags = [*TINY, "--devices", "2", "--total-steps", "512", "--checkpoint-every", "256", "--episodes", "1"]
+    flags = [
+        *TINY,
+        "--devices",
+        "2",
+        "--total-steps",
+        "512",
+        "--checkpoint-every",
+        "256",
+        "--episodes",
+        "1",
+    ]
     done = train(*flags, "--run-dir", whole)
     assert done.returncode == 0, done.stderr
     assert json.loads((whole / "manifest.json").read_text())["options"]["devices"] == 2
@@ -32,9 +44,14 @@ def test_a_shared_run_that_stopped_half_way_ends_with_the_same_bits_on_as_many_d
 
 @pytest.mark.parametrize(
     ("devices", "reason"),
-    [("3", "devices 3: must be a number that divides num_envs 4 or num_seeds 1"), ("0", "devices 0: must be a whole number from 1 to")],
+    [
+        ("3", "devices 3: must be a number that divides num_envs 4 or num_seeds 1"),
+        ("0", "devices 0: must be a whole number from 1 to"),
+    ],
 )
-def test_a_number_of_devices_that_does_not_come_out_even_is_refused_in_one_line(devices, reason, tmp_path):
+def test_a_number_of_devices_that_does_not_come_out_even_is_refused_in_one_line(
+    devices, reason, tmp_path
+):
     done = train(*TINY, "--devices", devices, "--run-dir", tmp_path / "run")
     assert done.returncode == 2
     assert done.stderr.startswith(f"error: --{reason}")

@@ -33,7 +33,13 @@ READABLE = [pytest.param(name, marks=needs(name)) for name in SINKS]
 @pytest.fixture(autouse=True)
 def _no_accounts(monkeypatch, tmp_path):
     """Nobody is logged in anywhere, and nothing is sent."""
-    for name in ("WANDB_MODE", "WANDB_API_KEY", "WANDB_PROJECT", "MLFLOW_TRACKING_URI", "MLFLOW_EXPERIMENT_NAME"):
+    for name in (
+        "WANDB_MODE",
+        "WANDB_API_KEY",
+        "WANDB_PROJECT",
+        "MLFLOW_TRACKING_URI",
+        "MLFLOW_EXPERIMENT_NAME",
+    ):
         monkeypatch.delenv(name, raising=False)
     monkeypatch.setenv("NETRC", str(tmp_path / "none"))
     for name in ("WANDB_CONFIG_DIR", "WANDB_CACHE_DIR", "WANDB_DATA_DIR"):
@@ -61,7 +67,11 @@ def read_tensorboard(run_dir, seed):
     for event in events(run_dir, seed):
         if event.session_log.status == SessionLog.START:
             found = [each for each in found if each[0] < event.step]
-        found += [(event.step, v.tag, v.simple_value) for v in event.summary.value if v.WhichOneof("value") == "simple_value"]
+        found += [
+            (event.step, v.tag, v.simple_value)
+            for v in event.summary.value
+            if v.WhichOneof("value") == "simple_value"
+        ]
     return found
 
 
@@ -87,9 +97,15 @@ def read_wandb(run_dir, seed):
     name, found = json.loads((run_dir / "sinks.json").read_text())["wandb"]["ids"][str(seed)], []
     for path in sorted(run_dir.glob(f"wandb/offline-run-*/run-{name}.wandb")):
         for record in map(Record.FromString, records(path)):
-            items = [item for item in record.history.item if len(item.nested_key) < 2]  # what has parts is a picture
+            items = [
+                item for item in record.history.item if len(item.nested_key) < 2
+            ]  # what has parts is a picture
             row = {item.key or item.nested_key[0]: json.loads(item.value_json) for item in items}
-            found += [(row["steps"], k, x) for k, x in row.items() if k != "steps" and not k.startswith("_")]
+            found += [
+                (row["steps"], k, x)
+                for k, x in row.items()
+                if k != "steps" and not k.startswith("_")
+            ]
     return found
 
 
@@ -98,7 +114,11 @@ def read_mlflow(run_dir, seed):
 
     client = MlflowClient(f"sqlite:///{run_dir / 'mlflow' / 'mlflow.db'}")
     name = json.loads((run_dir / "sinks.json").read_text())["mlflow"]["ids"][str(seed)]
-    return [(m.step, m.key, m.value) for key in client.get_run(name).data.metrics for m in client.get_metric_history(name, key)]
+    return [
+        (m.step, m.key, m.value)
+        for key in client.get_run(name).data.metrics
+        for m in client.get_metric_history(name, key)
+    ]
 
 
 READ = {"tensorboard": read_tensorboard, "wandb": read_wandb, "mlflow": read_mlflow}
@@ -108,8 +128,17 @@ def written(run_dir, seed):
     """What the run's own files say, by step and name."""
     rows = [row for row in metrics.read(run_dir / "metrics.jsonl") if row["seed"] == seed]
     looks = [row for row in metrics.read(run_dir / "evaluations.jsonl") if row["seed"] == seed]
-    numbers = {(row["steps"], k): x for row in rows for k, x in row.items() if k not in ("steps", "seed") and x is not None}
-    return numbers | {(row["steps"], f"evaluation/{k}"): row[k] for row in looks for k in ("return_mean", "return_std")}
+    numbers = {
+        (row["steps"], k): x
+        for row in rows
+        for k, x in row.items()
+        if k not in ("steps", "seed") and x is not None
+    }
+    return numbers | {
+        (row["steps"], f"evaluation/{k}"): row[k]
+        for row in looks
+        for k in ("return_mean", "return_std")
+    }
 
 
 def check(name, run_dir, seed, but=()):
@@ -117,7 +146,9 @@ def check(name, run_dir, seed, but=()):
     found, ours = READ[name](run_dir, seed), written(run_dir, seed)
     assert Counter((step, key) for step, key, _ in found) == Counter(ours.keys())
     kind = np.float32 if name == "tensorboard" else float
-    assert {(s, k): x for s, k, x in found if k not in but} == {(s, k): float(kind(x)) for (s, k), x in ours.items() if k not in but}
+    assert {(s, k): x for s, k, x in found if k not in but} == {
+        (s, k): float(kind(x)) for (s, k), x in ours.items() if k not in but
+    }
 
 
 @pytest.fixture(scope="module")
@@ -136,7 +167,10 @@ def fed(tmp_path_factory):
         for name in ("WANDB_MODE", "WANDB_API_KEY", "MLFLOW_TRACKING_URI"):
             patch.delenv(name, raising=False)
         patch.setenv("NETRC", str(run_dir.parent / "none"))
-        assert loop.train(small(seeds=SEEDS), dataclasses.replace(QUIET, run_dir=run_dir, log=names)) == 0
+        assert (
+            loop.train(small(seeds=SEEDS), dataclasses.replace(QUIET, run_dir=run_dir, log=names))
+            == 0
+        )
     return run_dir
 
 
@@ -159,7 +193,9 @@ def test_a_resumed_run_has_each_step_once_in_its_viewers(name, fed, tmp_path):
     stopped_half_way(fed, run_dir)
     assert manifest.options(run_dir).log == tuple(filter(present, SINKS))
     assert loop.resume(config, dataclasses.replace(QUIET, resume=run_dir, log=(name,))) == 0
-    there_already = () if feed.KINDS[name].goes_back else ("seconds",)  # else equal, of the iterations after the checkpoint
+    there_already = (
+        () if feed.KINDS[name].goes_back else ("seconds",)
+    )  # else equal, of the iterations after the checkpoint
     for seed in range(SEEDS):
         check(name, run_dir, seed, but=there_already)
 
@@ -176,7 +212,10 @@ def test_a_viewer_that_is_asked_for_later_gets_what_came_before(name, plain, tmp
 @needs("tensorboard")
 def test_tensorboard_has_the_configuration_and_the_curve(fed):
     values = {v.tag: v for event in events(fed, 1) for v in event.summary.value}
-    assert "| policy.clip | 0.2 |" in values["configuration/text_summary"].tensor.string_val[0].decode()
+    assert (
+        "| policy.clip_eps | 0.2 |"
+        in values["configuration/text_summary"].tensor.string_val[0].decode()
+    )
     assert "| seed | 1 |" in values["configuration/text_summary"].tensor.string_val[0].decode()
     assert values["curve.png"].image.encoded_image_string == (fed / "curve.png").read_bytes()
     assert (values["curve.png"].image.width, values["curve.png"].image.height) == (960, 600)
@@ -190,15 +229,20 @@ def test_mlflow_has_the_configuration_the_curve_and_how_it_ended(fed):
     found = client.search_runs([client.get_experiment_by_name("dgae_jax").experiment_id])
     assert sorted(run.info.run_name for run in found) == ["fed-seed-0", "fed-seed-1"]
     for run in found:
-        assert run.data.params["policy.clip"] == "0.2"
+        assert run.data.params["policy.clip_eps"] == "0.2"
         assert run.data.params["seed"] == run.info.run_name[-1]
         assert run.info.status == "FINISHED"
-        assert {file.path for file in client.list_artifacts(run.info.run_id)} == {"config.json", "curve.png"}
+        assert {file.path for file in client.list_artifacts(run.info.run_id)} == {
+            "config.json",
+            "curve.png",
+        }
     assert len(list((fed / "mlflow" / "files").rglob("curve.png"))) == SEEDS
 
 
 @needs("wandb")
-def test_weights_and_biases_stays_offline_where_nobody_is_logged_in_and_keeps_its_files_in_the_run(fed):
+def test_weights_and_biases_stays_offline_where_nobody_is_logged_in_and_keeps_its_files_in_the_run(
+    fed,
+):
     assert len(list(fed.glob("wandb/offline-run-*"))) == SEEDS
     assert list(fed.glob("wandb/offline-run-*/files/media/images/*.png"))
 
@@ -223,33 +267,62 @@ def failing(calls, at):
 
 
 @pytest.mark.parametrize("at", ["begin", "rows", "evaluations", "close"])
-def test_a_sink_that_fails_costs_one_warning_and_the_run_ends_as_it_would(at, plain, tmp_path, capsys, monkeypatch):
+def test_a_sink_that_fails_costs_one_warning_and_the_run_ends_as_it_would(
+    at, plain, tmp_path, capsys, monkeypatch
+):
     run_dir, calls = tmp_path / "run", []
     monkeypatch.setitem(feed.KINDS, "tensorboard", feed.Kind(failing(calls, at), goes_back=True))
-    assert loop.train(small(seeds=SEEDS), dataclasses.replace(QUIET, run_dir=run_dir, log=("tensorboard",))) == 0
+    assert (
+        loop.train(
+            small(seeds=SEEDS), dataclasses.replace(QUIET, run_dir=run_dir, log=("tensorboard",))
+        )
+        == 0
+    )
     assert calls.count(at) == 1
     assert calls[-1] == at
     rest = "the training goes on, and --resume adds what is missing"
-    assert capsys.readouterr().err == f"warning: --log tensorboard stops here (ConnectionError: the network is gone); {rest}\n"
+    assert (
+        capsys.readouterr().err
+        == f"warning: --log tensorboard stops here (ConnectionError: the network is gone); {rest}\n"
+    )
     assert last(run_dir).read_bytes() == last(plain).read_bytes()
 
 
 @needs("tensorboard")
-def test_a_viewer_that_failed_gets_what_it_lacks_when_the_run_is_resumed(tmp_path, capsys, monkeypatch):
+def test_a_viewer_that_failed_gets_what_it_lacks_when_the_run_is_resumed(
+    tmp_path, capsys, monkeypatch
+):
     run_dir, config = tmp_path / "run", small(seeds=SEEDS)
     with monkeypatch.context() as patch:
         patch.setitem(feed.KINDS, "tensorboard", feed.Kind(failing([], "rows"), goes_back=True))
-        assert loop.train(config, dataclasses.replace(QUIET, run_dir=run_dir, log=("tensorboard",))) == 0
+        assert (
+            loop.train(config, dataclasses.replace(QUIET, run_dir=run_dir, log=("tensorboard",)))
+            == 0
+        )
     assert not (run_dir / "tensorboard").exists()
     longer = dataclasses.replace(config, total_steps=10 * SMALL.samples_per_iteration)
-    assert loop.resume(longer, dataclasses.replace(QUIET, resume=run_dir, log=("tensorboard",))) == 0
+    assert (
+        loop.resume(longer, dataclasses.replace(QUIET, resume=run_dir, log=("tensorboard",))) == 0
+    )
     check("tensorboard", run_dir, 0)
 
 
-@pytest.mark.parametrize("data", ["", "[]", "{", '{"tensorboard": 3}', '{"tensorboard": {"ids": [1], "rows": "many", "evaluations": -1}}'])
+@pytest.mark.parametrize(
+    "data",
+    [
+        "",
+        "[]",
+        "{",
+        '{"tensorboard": 3}',
+        '{"tensorboard": {"ids": [1], "rows": "many", "evaluations": -1}}',
+    ],
+)
 def test_how_far_a_viewer_has_come_may_be_any_file_and_then_says_nothing(data, tmp_path):
     (tmp_path / "sinks.json").write_text(data)
-    assert all(noted == {"ids": {}, "rows": 0, "evaluations": 0} for noted in feed._read(tmp_path / "sinks.json").values())
+    assert all(
+        noted == {"ids": {}, "rows": 0, "evaluations": 0}
+        for noted in feed._read(tmp_path / "sinks.json").values()
+    )
 
 
 @pytest.mark.parametrize(
@@ -267,7 +340,10 @@ def test_a_viewer_that_is_unknown_or_named_twice_is_refused(log, message):
 @pytest.mark.parametrize("name", SINKS)
 def test_a_missing_library_is_refused_with_what_to_install(name, monkeypatch):
     monkeypatch.setattr(importlib.util, "find_spec", lambda _: None)
-    with pytest.raises(ConfigError, match=rf'log {name}: {SINKS[name]} is missing; pip install "dgae_jax\[{name}\]"'):
+    with pytest.raises(
+        ConfigError,
+        match=rf'log {name}: {SINKS[name]} is missing; pip install "dgae_jax\[{name}\]"',
+    ):
         validate_options(RunOptions(log=(name,)), SMALL)
 
 

@@ -63,7 +63,18 @@ def test_a_quiet_run_says_nothing_and_still_warns(capsys):
 
 def train(run_dir, shell="", **how):
     """The command on a tiny run, its streams as the shell says."""
-    argv = ["experiments/train.py", "--run-dir", run_dir, "--total-steps", "256", "--algo", "ppo", "--episodes", "1", *TINY]
+    argv = [
+        "experiments/train.py",
+        "--run-dir",
+        run_dir,
+        "--total-steps",
+        "256",
+        "--algo",
+        "ppo",
+        "--episodes",
+        "1",
+        *TINY,
+    ]
     script = f'exec "$0" "$@" {shell}'
     return subprocess.Popen(["bash", "-c", script, sys.executable, *map(str, argv)], cwd=ROOT, **how)  # fmt: skip
 
@@ -87,7 +98,9 @@ OLD = {**os.environ, "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0", "LC_ALL": "C
 def test_a_run_ends_well_whatever_becomes_of_its_output(shell, environment, tmp_path):
     assert_it_is_whole(train(tmp_path / "run", shell, env={**OLD, **environment}), tmp_path / "run")
     for name in ("metrics.jsonl", "evaluations.jsonl"):  # nothing that was printed went into a file
-        assert all(line.startswith(b'{"') for line in (tmp_path / "run" / name).read_bytes().splitlines())
+        assert all(
+            line.startswith(b'{"') for line in (tmp_path / "run" / name).read_bytes().splitlines()
+        )
 
 
 def test_a_reader_that_ends_after_the_first_line_ends_no_run(tmp_path):
@@ -100,7 +113,12 @@ def test_a_reader_that_ends_after_the_first_line_ends_no_run(tmp_path):
 @pytest.mark.parametrize("hung_up", [False, True])
 def test_a_live_bar_ends_no_run_on_an_old_terminal_or_one_that_is_gone(hung_up, tmp_path):
     master, slave = pty.openpty()
-    process = train(tmp_path / "run", stdout=slave, stderr=slave, env={**OLD, "PYTHONIOENCODING": "ascii", "TERM": "xterm"})
+    process = train(
+        tmp_path / "run",
+        stdout=slave,
+        stderr=slave,
+        env={**OLD, "PYTHONIOENCODING": "ascii", "TERM": "xterm"},
+    )
     os.close(slave)
     shown = [os.read(master, 1000)]
     if hung_up:

@@ -12,8 +12,14 @@ import pytest
 
 
 def _binaries():
-    found = [*sorted(Path("/usr/lib/postgresql").glob("*/bin"), reverse=True), Path("/usr/local/bin"), Path("/usr/bin")]
-    return next((path for path in found if (path / "initdb").exists() and (path / "pg_ctl").exists()), None)
+    found = [
+        *sorted(Path("/usr/lib/postgresql").glob("*/bin"), reverse=True),
+        Path("/usr/local/bin"),
+        Path("/usr/bin"),
+    ]
+    return next(
+        (path for path in found if (path / "initdb").exists() and (path / "pg_ctl").exists()), None
+    )
 
 
 def _unprivileged():
@@ -37,16 +43,35 @@ def postgres():
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
-    home = Path(tempfile.mkdtemp(prefix="dgae_jax-postgres-", dir="/tmp"))  # TMPDIR may be where that user cannot go
+    home = Path(
+        tempfile.mkdtemp(prefix="dgae_jax-postgres-", dir="/tmp")
+    )  # TMPDIR may be where that user cannot go
     os.chown(home, user, -1)
     data, log = home / "data", home / "log"
 
     def run(*command):
         words = [*before, str(binaries / command[0]), *map(str, command[1:])]
-        subprocess.run(words, cwd=home, check=True, stdout=subprocess.DEVNULL, stderr=subprocess.STDOUT, timeout=120)
+        subprocess.run(
+            words,
+            cwd=home,
+            check=True,
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.STDOUT,
+            timeout=120,
+        )
 
     run("initdb", "-D", data, "-A", "trust", "-U", "tuner", "--no-sync")
-    run("pg_ctl", "-D", data, "-l", log, "-w", "-o", f"-p {port} -k {home} -c listen_addresses=127.0.0.1 -c fsync=off", "start")
+    run(
+        "pg_ctl",
+        "-D",
+        data,
+        "-l",
+        log,
+        "-w",
+        "-o",
+        f"-p {port} -k {home} -c listen_addresses=127.0.0.1 -c fsync=off",
+        "start",
+    )
     try:
         yield f"postgresql://tuner@127.0.0.1:{port}/postgres"
     finally:

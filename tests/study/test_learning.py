@@ -16,6 +16,10 @@ actions get 18."""
 @pytest.mark.slow
 @pytest.mark.parametrize("algo", FLOORS)
 def test_150_000_samples_of_hopper_teach_an_algorithm_to_hop(algo):
-    config = dataclasses.replace(preset("tuned", algo, "hopper"), physics="native", total_steps=150_000, num_seeds=2)
+    config = dataclasses.replace(
+        preset("tuned", algo, "hopper"), physics="native", total_steps=150_000, num_seeds=2
+    )
     evaluation = train(config, quiet=True, episodes=20, cache_dir=QUIET.cache_dir).evaluation
-    assert [seed["return_mean"] > FLOORS[algo] for seed in evaluation["seeds"]] == [True, True], evaluation
+    assert [seed["return_mean"] > FLOORS[algo] for seed in evaluation["seeds"]] == [True, True], (
+        evaluation
+    )

@@ -7,7 +7,8 @@ import pytest
 import dgae_jax as dg
 from dgae_jax.cli import reproduce
 from dgae_jax.cli.arguments import parse_known
-from dgae_jax.configs.config import ConfigError, resolve
+from dgae_jax.configs.config import ConfigError
+from dgae_jax.configs.resolved import resolve
 from dgae_jax.configs.serial import to_dict
 from dgae_jax.study import matrix
 from dgae_jax.study.variants import VARIANTS
@@ -35,7 +36,10 @@ def test_seeds_side_by_side_are_one_cell_named_by_its_first_and_last():
 
 
 def test_only_seeds_that_follow_each_other_run_side_by_side():
-    with pytest.raises(ConfigError, match=r"seeds_per_run 2: must be 1, or a number of seeds that follow each other, not \[0, 2\]"):
+    with pytest.raises(
+        ConfigError,
+        match=r"seeds_per_run 2: must be 1, or a number of seeds that follow each other, not \[0, 2\]",
+    ):
         cells((0, 2, 3, 4), 2)
 
 
@@ -53,9 +57,13 @@ def test_a_cell_with_another_configuration_is_refused_by_name_and_nothing_change
     with matrix.opened(tmp_path, cells(), "one"):
         pass
     before = (tmp_path / "study.json").read_bytes()
-    other = cells(make=lambda task, algo: resolve(dg.Config(env=task, algo=algo, physics="native", gamma=0.9)))
+    other = cells(
+        make=lambda task, algo: resolve(dg.Config(env=task, algo=algo, physics="native", gamma=0.9))
+    )
     with (
-        pytest.raises(ConfigError, match=r"^cell hopper-ppo-0: its gamma must be 0\.99 as in .*, not 0\.9"),
+        pytest.raises(
+            ConfigError, match=r"^cell hopper-ppo-0: its gamma must be 0\.99 as in .*, not 0\.9"
+        ),
         matrix.opened(tmp_path, other, ""),
     ):
         pass
@@ -73,7 +81,10 @@ def test_nobody_else_has_a_study_meanwhile(tmp_path):
 
 def test_a_directory_of_something_else_is_left_alone(tmp_path):
     (tmp_path / "thesis.tex").touch()
-    with pytest.raises(ConfigError, match="must be a study, or a new or empty directory"), matrix.opened(tmp_path, cells(), ""):
+    with (
+        pytest.raises(ConfigError, match="must be a study, or a new or empty directory"),
+        matrix.opened(tmp_path, cells(), ""),
+    ):
         pass
     assert [path.name for path in tmp_path.iterdir()] == ["thesis.tex"]
 
@@ -82,7 +93,10 @@ def test_a_directory_of_something_else_is_left_alone(tmp_path):
     ("change", "message"),
     [
         (lambda data: data | {"schema": 2}, "has schema 2, this version reads 1"),
-        (lambda data: data | {"cells": {"../../hopper": data["cells"]["hopper-ppo-0"]}}, "has no such name"),
+        (
+            lambda data: data | {"cells": {"../../hopper": data["cells"]["hopper-ppo-0"]}},
+            "has no such name",
+        ),
         (lambda data: data | {"cells": [1]}, "must be a study that can be read"),
         (lambda data: {}, "must be a study that can be read"),
     ],
@@ -90,7 +104,9 @@ def test_a_directory_of_something_else_is_left_alone(tmp_path):
 def test_a_study_that_cannot_be_understood_is_refused(tmp_path, change, message):
     with matrix.opened(tmp_path, cells(), "one"):
         pass
-    (tmp_path / "study.json").write_text(json.dumps(change(json.loads((tmp_path / "study.json").read_text()))))
+    (tmp_path / "study.json").write_text(
+        json.dumps(change(json.loads((tmp_path / "study.json").read_text())))
+    )
     with pytest.raises(ConfigError, match=message):
         matrix.read(tmp_path)
 
@@ -101,7 +117,13 @@ def test_a_directory_without_a_study_is_none(tmp_path):
 
 
 def test_a_variant_takes_the_place_of_the_algorithm_in_the_name_of_a_cell():
-    (cell,) = matrix.matrix(["brax:ant"], ["kappa-0.1"], (3, 4), 2, lambda task, kind: resolve(dg.Config(env=task, algo="dppo")))
+    (cell,) = matrix.matrix(
+        ["brax:ant"],
+        ["kappa-0.1"],
+        (3, 4),
+        2,
+        lambda task, kind: resolve(dg.Config(env=task, algo="dppo")),
+    )
     assert (cell.name, cell.kind) == ("brax_ant-kappa-0.1-3-4", "kappa-0.1")
     assert [cell.kind for cell in cells((0,))] == ["ppo", "dppo", "ppo", "dppo"]
 
@@ -109,7 +131,10 @@ def test_a_variant_takes_the_place_of_the_algorithm_in_the_name_of_a_cell():
 def test_every_variant_of_a_question_is_a_configuration_of_its_own():
     for question in VARIANTS:
         arguments, rest = parse_known(
-            reproduce.Arguments, "", ["study", "--variants", question, "--envs", "hopper", "--seeds", "0"], rest=reproduce.REST
+            reproduce.Arguments,
+            "",
+            ["study", "--variants", question, "--envs", "hopper", "--seeds", "0"],
+            rest=reproduce.REST,
         )
         found, _ = reproduce._cells(arguments, rest)
         assert [cell.kind for cell in found] == list(VARIANTS[question])
@@ -119,7 +144,10 @@ def test_every_variant_of_a_question_is_a_configuration_of_its_own():
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        ("--variants luck", "variants luck: must be one of attribution, attribution-noise, calibration, risk"),
+        (
+            "--variants luck",
+            "variants luck: must be one of attribution, attribution-noise, calibration, risk",
+        ),
         ("--variants risk --algos ppo", "algos ppo: must be left out with --variants"),
         (
             "--variants calibration --critic.target bellman",
@@ -129,16 +157,25 @@ def test_every_variant_of_a_question_is_a_configuration_of_its_own():
             "--variants attribution --critic.kappa=0.5",
             "--critic.kappa: must be left out with --variants attribution, whose variants set it",
         ),
-        ("--variants risk --config best.json", "config best.json: must be left out with --variants"),
+        (
+            "--variants risk --config best.json",
+            "config best.json: must be left out with --variants",
+        ),
     ],
 )
 def test_variants_have_algorithms_of_their_own(words, message):
-    arguments, rest = parse_known(reproduce.Arguments, "", ["study", *words.split()], rest=reproduce.REST)
+    arguments, rest = parse_known(
+        reproduce.Arguments, "", ["study", *words.split()], rest=reproduce.REST
+    )
     with pytest.raises(ConfigError, match=message):
         reproduce._cells(arguments, rest)
 
 
 def test_with_noise_the_variants_have_the_names_that_a_report_gives_them_and_its_mark():
-    assert [name.removesuffix("+noise") for name in VARIANTS["attribution-noise"]] == list(VARIANTS["attribution"])
+    assert [name.removesuffix("+noise") for name in VARIANTS["attribution-noise"]] == list(
+        VARIANTS["attribution"]
+    )
     for variants in VARIANTS.values():
-        assert all(name.endswith("+noise") == ("--noise." in words) for name, words in variants.items())
+        assert all(
+            name.endswith("+noise") == ("--noise." in words) for name, words in variants.items()
+        )

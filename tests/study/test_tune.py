@@ -36,14 +36,21 @@ OPTIONS = RunOptions(cache_dir=QUIET.cache_dir, episodes=1)
 def _features_may_change():
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", optuna.exceptions.ExperimentalWarning)
-        warnings.filterwarnings("ignore", "Heartbeat of storage")  # of asking outside of Optuna's own loop
+        warnings.filterwarnings(
+            "ignore", "Heartbeat of storage"
+        )  # of asking outside of Optuna's own loop
         yield
 
 
 def tuning(path, *words, **changes):
     config = changes.pop("config", small())
     space = space_of(words or ("gamma=0.9:0.999", "lam=0.8:1"), config)
-    return Tuning(config, space, path, **{"options": OPTIONS, "trials": 3, "seeds": 1, "heartbeat": 1, **changes})
+    return Tuning(
+        config,
+        space,
+        path,
+        **{"options": OPTIONS, "trials": 3, "seeds": 1, "heartbeat": 1, **changes},
+    )
 
 
 def opened(ours):
@@ -54,9 +61,24 @@ def opened(ours):
 
 def start(study, *more):
     """The real command on trials of eight iterations."""
-    argv = ["--study", str(study), "--algo", "ppo", "--total-steps", "512", "--episode-length", "20", "--episodes", "1", *TINY, *more]
+    argv = [
+        "--study",
+        str(study),
+        "--algo",
+        "ppo",
+        "--total-steps",
+        "512",
+        "--episode-length",
+        "20",
+        "--episodes",
+        "1",
+        *TINY,
+        *more,
+    ]
     words = [sys.executable, "experiments/tune.py", "--tuning-seeds", "1", *argv]
-    return subprocess.Popen(words, cwd=ROOT, text=True, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+    return subprocess.Popen(
+        words, cwd=ROOT, text=True, stdout=subprocess.PIPE, stderr=subprocess.PIPE
+    )
 
 
 def table_of(study):
@@ -72,7 +94,9 @@ def wait_for(what, seconds=120):
 
 def running(study):
     """Trials that a process has given a sign of life for."""
-    return sum("taken" in trial.user_attrs for trial in study.get_trials(states=(TrialState.RUNNING,)))
+    return sum(
+        "taken" in trial.user_attrs for trial in study.get_trials(states=(TrialState.RUNNING,))
+    )
 
 
 @pytest.fixture(scope="module")
@@ -91,7 +115,9 @@ def test_a_tuning_finishes_as_many_trials_as_were_asked_for_and_leaves_them_in_a
     assert [row["trial"] for row in rows] == list("01234")
     assert {row["state"] for row in rows} <= {"complete", "pruned"}
     assert sum(line.startswith("trial ") and "; best " in line for line in lines) == 5
-    assert all(0.95 <= float(row["gamma"]) <= 0.9999 and 0.5 <= float(row["lam"]) <= 1 for row in rows)
+    assert all(
+        0.95 <= float(row["gamma"]) <= 0.9999 and 0.5 <= float(row["lam"]) <= 1 for row in rows
+    )
     assert len({row["gamma"] for row in rows}) == 5
 
 
@@ -120,17 +146,21 @@ def test_the_best_file_is_a_configuration_to_train_from_with_the_settings_of_the
     study, lines = tuned
     rows = [row for row in table_of(study) if row["state"] == "complete"]
     best = max(rows, key=lambda row: float(row["return_mean"]))
-    result = json.loads((study / "trials" / f"{int(best['trial']):04d}" / "evaluation.json").read_text())
+    result = json.loads(
+        (study / "trials" / f"{int(best['trial']):04d}" / "evaluation.json").read_text()
+    )
     assert float(best["return_mean"]) == result["return_mean"]
     config, _ = parsed(["--config", str(study / "best.json")])
-    assert (config.gamma, config.lam) == (float(best["gamma"]), float(best["lam"]))
+    assert (config.gamma, config.gae_lambda) == (float(best["gamma"]), float(best["lam"]))
     assert (config.seed, config.num_seeds, config.algo, config.num_envs) == (0, 1, "ppo", 4)
     assert lines[-1] == f"train with the best settings: dgae train --config {study / 'best.json'}"
 
 
 def test_the_printed_table_is_aligned_and_has_the_best_first(tuned):
     _, lines = tuned
-    head = next(i for i, line in enumerate(lines) if line.split() == ["trial", "return", "gamma", "lam"])
+    head = next(
+        i for i, line in enumerate(lines) if line.split() == ["trial", "return", "gamma", "lam"]
+    )
     table = lines[head : next(i for i, line in enumerate(lines) if " of them pruned; " in line)]
     assert {len(line) for line in table} == {len(table[0])}
     assert len(table[0]) <= 80
@@ -165,11 +195,19 @@ def test_a_study_that_tunes_something_else_is_refused_with_both_values(tuned):
     process = start(tuned[0], "--search", "gamma=0.5:0.6", "--trials", "5")
     out, errors = process.communicate(timeout=120)
     assert (process.returncode, out) == (2, "")
-    assert errors == "error: --search gamma 0.5:0.6: must be 0.95:0.9999 as in the study first, or with another --study\n"
+    assert (
+        errors
+        == "error: --search gamma 0.5:0.6: must be 0.95:0.9999 as in the study first, or with another --study\n"
+    )
 
 
 def test_a_killed_process_loses_no_finished_trial_and_the_others_finish_its_own(tmp_path):
-    ours = tuning(tmp_path / "study", trials=4, workers=2, config=dataclasses.replace(small(), total_steps=64 * 200))
+    ours = tuning(
+        tmp_path / "study",
+        trials=4,
+        workers=2,
+        config=dataclasses.replace(small(), total_steps=64 * 200),
+    )
     _, study = opened(ours)
     processes = tune.start(ours)
     wait_for(lambda: finished(study) and running(study) == 2)
@@ -195,8 +233,14 @@ def test_a_signal_stops_it_with_its_exit_code_and_the_same_command_goes_on_where
     process.send_signal(signal.SIGINT)
     out, errors = process.communicate(timeout=120)
     assert process.returncode == 130
-    assert errors == "SIGINT: finishing what is running, then saving; a second signal ends it at once\n"
-    assert out.splitlines()[-1] == "stopped by SIGINT: 0 of 2 trials are finished; the same command goes on"
+    assert (
+        errors
+        == "SIGINT: finishing what is running, then saving; a second signal ends it at once\n"
+    )
+    assert (
+        out.splitlines()[-1]
+        == "stopped by SIGINT: 0 of 2 trials are finished; the same command goes on"
+    )
     process = start(study, *more)
     out, errors = process.communicate(timeout=240)
     assert (process.returncode, errors) == (0, ""), out
@@ -208,7 +252,9 @@ def test_a_signal_stops_it_with_its_exit_code_and_the_same_command_goes_on_where
 @pytest.mark.slow
 def test_machines_without_a_common_disk_share_a_study_in_postgresql(postgres, tmp_path):
     places = [tmp_path / machine / "shared" for machine in ("one", "two")]
-    processes = [start(place, "--storage", postgres, "--trials", "4", "--workers", "1") for place in places]
+    processes = [
+        start(place, "--storage", postgres, "--trials", "4", "--workers", "1") for place in places
+    ]
     for process in processes:
         out, errors = process.communicate(timeout=300)
         assert (process.returncode, errors) == (0, ""), out
@@ -247,13 +293,18 @@ def test_trials_side_by_side_are_worth_what_they_are_alone(tmp_path):
     with Signals() as signals:
         values = side_by_side.train(ours, study, trials, signals)
     alone = [
-        loop.start(ours.config_of(trial.params), dataclasses.replace(OPTIONS, run_dir=tmp_path / str(trial.number))) for trial in trials
+        loop.start(
+            ours.config_of(trial.params),
+            dataclasses.replace(OPTIONS, run_dir=tmp_path / str(trial.number)),
+        )
+        for trial in trials
     ]
     assert values == pytest.approx([value_of(run.evaluation) for run in alone], rel=1e-3)
     assert len(set(values)) == 3
-    assert [directory.read_config_file(ours.directory / "trials" / f"000{i}" / "config.json").gamma for i in range(3)] == [
-        trial.params["gamma"] for trial in trials
-    ]
+    assert [
+        directory.read_config_file(ours.directory / "trials" / f"000{i}" / "config.json").gamma
+        for i in range(3)
+    ] == [trial.params["gamma"] for trial in trials]
 
 
 def test_a_worker_trains_what_is_left_side_by_side(tmp_path):
@@ -270,7 +321,9 @@ class Hopeless(optuna.pruners.BasePruner):
 
 
 @pytest.mark.parametrize("side_by_side", [1, 2])
-def test_a_trial_worse_than_most_ends_after_its_first_quarter_with_the_return_that_it_had(side_by_side, tmp_path, monkeypatch):
+def test_a_trial_worse_than_most_ends_after_its_first_quarter_with_the_return_that_it_had(
+    side_by_side, tmp_path, monkeypatch
+):
     monkeypatch.setattr(optuna.pruners, "MedianPruner", Hopeless)
     ours = tuning(tmp_path / "study", side_by_side=side_by_side, trials=side_by_side)
     _, study = opened(ours)
@@ -285,25 +338,39 @@ def test_a_trial_worse_than_most_ends_after_its_first_quarter_with_the_return_th
 
 
 def test_settings_that_break_down_count_as_a_trial_without_a_return(tmp_path):
-    config = dataclasses.replace(small(), policy=dataclasses.replace(small().policy, max_grad_norm=1e30))
+    config = dataclasses.replace(
+        small(), policy=dataclasses.replace(small().policy, max_grad_norm=1e30)
+    )
     words = ("policy.learning_rate=1e29,1e30",)
-    ours = tuning(tmp_path / "study", *words, config=config, options=dataclasses.replace(OPTIONS, max_nonfinite=1), trials=1)
+    ours = tuning(
+        tmp_path / "study",
+        *words,
+        config=config,
+        options=dataclasses.replace(OPTIONS, max_nonfinite=1),
+        trials=1,
+    )
     _, study = opened(ours)
     assert worker.serve(ours, 0) == 0
     assert [(trial.state, trial.value) for trial in finished(study)] == [(TrialState.PRUNED, None)]
 
 
 def test_values_that_do_not_go_together_count_as_a_trial_without_a_return(tmp_path):
-    ours = tuning(tmp_path / "study", "num_envs=2,4", "horizon=8,16", "policy.minibatches=4,32", trials=2)
+    ours = tuning(
+        tmp_path / "study", "num_envs=2,4", "num_steps=8,16", "policy.minibatches=4,32", trials=2
+    )
     _, study = opened(ours)
-    study.enqueue_trial({"num_envs": 2, "horizon": 8, "policy.minibatches": 32})  # 16 samples in 32 minibatches
+    study.enqueue_trial(
+        {"num_envs": 2, "num_steps": 8, "policy.minibatches": 32}
+    )  # 16 samples in 32 minibatches
     assert worker.serve(ours, 0) == 0
     assert [trial.state for trial in finished(study)] == [TrialState.COMPLETE, TrialState.PRUNED]
     assert study.trials[1].value is None
     assert [path.name for path in (ours.directory / "trials").iterdir()] == ["0000"]
 
 
-def test_values_that_do_not_fit_the_machine_count_as_a_trial_without_a_return(tmp_path, monkeypatch):
+def test_values_that_do_not_fit_the_machine_count_as_a_trial_without_a_return(
+    tmp_path, monkeypatch
+):
     ours = tuning(tmp_path / "study", "policy.hidden=4000x4000,4096x4096", trials=1)
     _, study = opened(ours)
     monkeypatch.setattr(machine, "memory", lambda: 2**26)
@@ -312,20 +379,35 @@ def test_values_that_do_not_fit_the_machine_count_as_a_trial_without_a_return(tm
 
 
 def test_a_machine_on_which_nothing_can_be_trained_takes_no_trial(tmp_path, capsys):
-    ours = tuning(tmp_path / "study", options=dataclasses.replace(OPTIONS, cache_dir="/dev/null/below"))
+    ours = tuning(
+        tmp_path / "study", options=dataclasses.replace(OPTIONS, cache_dir="/dev/null/below")
+    )
     _, study = opened(ours)
     assert worker.serve(ours, 0) == 1
-    assert "stopped: cache_dir /dev/null/below: must be a directory that can be written" in capsys.readouterr().err
+    assert (
+        "stopped: cache_dir /dev/null/below: must be a directory that can be written"
+        in capsys.readouterr().err
+    )
     assert [trial.state for trial in study.trials] == [TrialState.WAITING]
 
 
-def test_trials_that_are_all_worth_the_same_have_a_page_without_the_picture_of_their_spread(tmp_path):
+def test_trials_that_are_all_worth_the_same_have_a_page_without_the_picture_of_their_spread(
+    tmp_path,
+):
     ours = tuning(tmp_path / "study")
     _, study = opened(ours)
     for gamma in (0.91, 0.92, 0.93, 0.94):
-        study.add_trial(create_trial(params={"gamma": gamma, "lam": 0.9}, distributions=distributions(ours), value=0.0))
+        study.add_trial(
+            create_trial(
+                params={"gamma": gamma, "lam": 0.9}, distributions=distributions(ours), value=0.0
+            )
+        )
     assert outcome.write(ours, study) == 0
-    assert {path.name for path in ours.directory.iterdir()} >= {"history.png", "tuning.html", "best.json"}
+    assert {path.name for path in ours.directory.iterdir()} >= {
+        "history.png",
+        "tuning.html",
+        "best.json",
+    }
     assert not (ours.directory / "importances.png").exists()
 
 
@@ -335,9 +417,16 @@ def test_a_full_disk_at_the_end_is_one_line(tmp_path, monkeypatch):
 
     ours = tuning(tmp_path / "study", trials=1)
     _, study = opened(ours)
-    study.add_trial(create_trial(params={"gamma": 0.91, "lam": 0.9}, distributions=distributions(ours), value=0.0))
+    study.add_trial(
+        create_trial(
+            params={"gamma": 0.91, "lam": 0.9}, distributions=distributions(ours), value=0.0
+        )
+    )
     monkeypatch.setattr(files, "replace", full)
-    with pytest.raises(ConfigError, match=r"trials\.csv: must be a file that can be written \(No space left on device\)"):
+    with pytest.raises(
+        ConfigError,
+        match=r"trials\.csv: must be a file that can be written \(No space left on device\)",
+    ):
         tune.tune(ours)
 
 
@@ -347,7 +436,9 @@ def test_no_more_trials_are_taken_than_are_left(tmp_path):
     assert [trial.number for trial in take(study, ours)] == [0, 1]
     assert [trial.number for trial in take(study, ours)] == [2]
     assert take(study, ours) == []
-    requeue(study, study.ask())  # a fourth, which another process took at the same moment and gave back
+    requeue(
+        study, study.ask()
+    )  # a fourth, which another process took at the same moment and gave back
     assert take(study, ours) == []
 
 
@@ -381,8 +472,8 @@ def refusal(monkeypatch, capsys, tmp_path):
     ("argv", "line"),
     [
         (["--search", "gamma=0.9:2"], "--search gamma=0.9:2: must be valid throughout (gamma 2.0: must be a number from 0 to 1)"),
-        (["--search", "policy.radius=0.1:0.2"],
-         "--search policy.radius=0.1:0.2: must be valid throughout (policy.radius 0.1: must be left out: ppo with clip does not use it)"),
+        (["--search", "policy.max_kl=0.1:0.2"],
+         "--search policy.max_kl=0.1:0.2: must be valid throughout (policy.max_kl 0.1: must be left out: ppo with clip does not use it)"),
         (["--search"], "--search: must name a setting, gamma=0.95:0.999 for one"),
         (["--trials", "0"], "--trials 0: must be a whole number from 1 to 100,000 (Optuna reads all of them before each)"),
         (["--tuning-seeds", "0"], "--tuning-seeds 0: must be a whole number from 1 to 100 (every one is a whole run)"),
@@ -397,7 +488,7 @@ def refusal(monkeypatch, capsys, tmp_path):
         (["--side-by-side", "4", "--debug-nonfinite"],
          "--debug-nonfinite True: must be left out with --side-by-side, whose trials have no run directories"),
         (["--gamma", "3"], "--gamma 3.0: must be a number from 0 to 1"),
-        (["--clip", "0.1"], "--clip: is written --policy.clip"),
+        (["--clip", "0.1"], "--clip: is written --policy.clip_eps-eps"),
         (["--workers", "100000"], None),
         (["--no-such-flag"], None),
     ],
@@ -407,14 +498,22 @@ def test_bad_input_is_one_line_before_anything_is_written(argv, line, refusal):
     assert line is None or said == line
 
 
-def test_a_database_that_is_not_there_is_bad_input_and_its_password_is_not_shown(monkeypatch, capsys, tmp_path):
+def test_a_database_that_is_not_there_is_bad_input_and_its_password_is_not_shown(
+    monkeypatch, capsys, tmp_path
+):
     where = "postgresql://me:secret@127.0.0.1:1/db"
-    monkeypatch.setattr(sys, "argv", ["tune.py", "--physics", "native", "--study", str(tmp_path / "study"), "--storage", where])
+    monkeypatch.setattr(
+        sys,
+        "argv",
+        ["tune.py", "--physics", "native", "--study", str(tmp_path / "study"), "--storage", where],
+    )
     with pytest.raises(SystemExit) as stop:
         command("tune")()
     out, errors = capsys.readouterr()
     assert (stop.value.code, out, errors.count("\n")) == (2, "", 1)
-    assert errors.startswith("error: --storage postgresql+psycopg://me:***@127.0.0.1:1/db: must be a database that can be reached (")
+    assert errors.startswith(
+        "error: --storage postgresql+psycopg://me:***@127.0.0.1:1/db: must be a database that can be reached ("
+    )
 
 
 def test_a_study_of_something_else_is_refused_also_with_other_seeds(tmp_path):
@@ -427,6 +526,10 @@ def test_a_study_of_something_else_is_refused_also_with_other_seeds(tmp_path):
         ({"eval_engine": "native"}, "eval_engine native: must be gymnasium as"),
     ):
         with pytest.raises(ConfigError, match=message):
-            open_study(dataclasses.replace(ours, options=dataclasses.replace(OPTIONS, **changes)), storage)
+            open_study(
+                dataclasses.replace(ours, options=dataclasses.replace(OPTIONS, **changes)), storage
+            )
     with pytest.raises(ConfigError, match="num_envs 8: must be 4 as in the study study"):
-        open_study(dataclasses.replace(ours, config=dataclasses.replace(ours.config, num_envs=8)), storage)
+        open_study(
+            dataclasses.replace(ours, config=dataclasses.replace(ours.config, num_envs=8)), storage
+        )

@@ -14,8 +14,10 @@ from dgae_jax.export.outside.policy import Policy
 def make_world(policy: Policy) -> Any:
     """The task that the policy was trained on, with the same time limit."""
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # that v4 is not the newest version is known
-        return gymnasium.make(str(policy.arrays["env"]), max_episode_steps=int(policy.arrays["episode_length"]))
+        warnings.simplefilter("ignore")  # that v4 is not the latest version is known
+        return gymnasium.make(
+            str(policy.arrays["env"]), max_episode_steps=int(policy.arrays["episode_length"])
+        )
 
 
 def play(world: Any, policy: Policy, number: int) -> float:
@@ -32,7 +34,12 @@ def main() -> None:
     """Play, and print the returns."""
     parser = argparse.ArgumentParser(description="A trained policy plays in Gymnasium.")
     parser.add_argument("--episodes", type=int, default=5, help="episodes to play (default: 5)")
-    parser.add_argument("--seed", type=int, default=0, help="decides the initial states, as in `dgae evaluate` (default: 0)")
+    parser.add_argument(
+        "--seed",
+        type=int,
+        default=0,
+        help="decides the initial states, as in `dgae evaluate` (default: 0)",
+    )
     arguments = parser.parse_args()
     if arguments.episodes < 1 or arguments.seed < 0:
         parser.error("--episodes must be at least 1 and --seed at least 0")

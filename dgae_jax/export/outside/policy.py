@@ -14,7 +14,9 @@ class Policy:
 
     def __call__(self, obs: Any) -> np.ndarray:
         """The action [..., A] in each observation [..., O]: the mean, within the actuators' range."""
-        return np.clip(self._outputs("policy", obs), self.arrays["action_low"], self.arrays["action_high"])
+        return np.clip(
+            self._outputs("policy", obs), self.arrays["action_low"], self.arrays["action_high"]
+        )
 
     def quantiles(self, obs: Any) -> np.ndarray:
         """The critic's quantiles [..., K] of the discounted return, K = 1 for a scalar critic, in the units it was trained in."""
@@ -23,7 +25,10 @@ class Policy:
             return np.sort(outputs)
         if "critic_steps" not in self.arrays:
             return outputs
-        return outputs[..., :1] + np.logaddexp(np.float32(0), outputs[..., 1:]) @ self.arrays["critic_steps"]
+        return (
+            outputs[..., :1]
+            + np.logaddexp(np.float32(0), outputs[..., 1:]) @ self.arrays["critic_steps"]
+        )
 
     def _outputs(self, network: str, obs: Any) -> np.ndarray:
         a = self.arrays

@@ -24,7 +24,9 @@ _BLOCK = 128
 _CORRECTS_ROTATION = int(mujoco.__version__.split(".")[0]) >= 4
 
 
-def jax_engine(spec: mujoco.MjSpec, frame_skip: int, reads: Reads, *, max_contacts: int | None = None) -> Physics:
+def jax_engine(
+    spec: mujoco.MjSpec, frame_skip: int, reads: Reads, *, max_contacts: int | None = None
+) -> Physics:
     """MuJoCo in JAX, advancing one world; vmap it. Raises ValueError, naming the reason, for a model it does not cover.
 
     `max_contacts` bounds the contacts with the ground, of which the nearest are kept; by default it is the bound that is
@@ -33,8 +35,14 @@ def jax_engine(spec: mujoco.MjSpec, frame_skip: int, reads: Reads, *, max_contac
     model = spec.compile()
     refuse_uncovered(model)
     tree = dynamics.tree_of(model)
-    scene = scene_of(tree, known_bound(spec.modelname, model) if max_contacts is None else max_contacts)
-    h, free, torsos = model.opt.timestep, tree.floating, len(body_ids(model, reads))  # of one tree only the root can float
+    scene = scene_of(
+        tree, known_bound(spec.modelname, model) if max_contacts is None else max_contacts
+    )
+    h, free, torsos = (
+        model.opt.timestep,
+        tree.floating,
+        len(body_ids(model, reads)),
+    )  # of one tree only the root can float
 
     def forward(guess, qpos, qvel, ctrl):
         """`qacc`, and `xpos` and `cfrc_ext` as far as they are read."""
@@ -62,14 +70,21 @@ def jax_engine(spec: mujoco.MjSpec, frame_skip: int, reads: Reads, *, max_contac
             return ((rate, acceleration), (sum_q + b * rate, sum_v + b * acceleration), seen), None
 
         # the first stage is at a = 0, so the accelerations before it only start the solver
-        first, zero = (jnp.zeros_like(v), state.qacc_warmstart), (jnp.zeros_like(v), jnp.zeros_like(v))
+        first, zero = (
+            (jnp.zeros_like(v), state.qacc_warmstart),
+            (jnp.zeros_like(v), jnp.zeros_like(v)),
+        )
         tableau = jnp.asarray(_STAGE, v.dtype), jnp.asarray(_WEIGHT, v.dtype)
-        ((_, warmstart), (dq, dv), seen), _ = jax.lax.scan(stage, (first, zero, (state.xpos, state.cfrc_ext)), tableau)
+        ((_, warmstart), (dq, dv), seen), _ = jax.lax.scan(
+            stage, (first, zero, (state.xpos, state.cfrc_ext)), tableau
+        )
         return PhysicsState(_integrate(q, h * dq, free), v + h * dv, warmstart, *seen)
 
     @jax.default_matmul_precision("highest")  # TF32 on GPUs is no physics
     def advance(state: PhysicsState, ctrl: Array) -> PhysicsState:
-        return jax.lax.scan(lambda s, _: (substep(s, ctrl), None), state, None, length=frame_skip)[0]
+        return jax.lax.scan(lambda s, _: (substep(s, ctrl), None), state, None, length=frame_skip)[
+            0
+        ]
 
     return Physics(model, of_one_world(_in_blocks(advance)), "jax", reads)
 
@@ -87,7 +102,10 @@ def _in_blocks(advance):
             return jnp.moveaxis(full.reshape(*x.shape[:-1], count, size), -2, 0)
 
         out = jax.lax.map(lambda block: advance(*block), jax.tree.map(split, (state, ctrl)))
-        return jax.tree.map(lambda x: jnp.moveaxis(x, 0, -2).reshape(*x.shape[1:-1], count * size)[..., :worlds], out)
+        return jax.tree.map(
+            lambda x: jnp.moveaxis(x, 0, -2).reshape(*x.shape[1:-1], count * size)[..., :worlds],
+            out,
+        )
 
     def whole_or_blocks(state: PhysicsState, ctrl: Array) -> PhysicsState:
         if ctrl.shape[-1] <= _BLOCK:
@@ -101,7 +119,9 @@ def _integrate(qpos: Array, move: Array, free: bool) -> Array:
     """The position after a displacement in velocity coordinates."""
     if not free:
         return qpos + move
-    return jnp.concatenate([qpos[:3] + move[:3], spatial.rotate(qpos[3:7], move[3:6]), qpos[7:] + move[6:]])
+    return jnp.concatenate(
+        [qpos[:3] + move[:3], spatial.rotate(qpos[3:7], move[3:6]), qpos[7:] + move[6:]]
+    )
 
 
 def _inverse_exponential(theta: Array, omega: Array) -> Array:

@@ -64,7 +64,10 @@ class _Iterate(NamedTuple):
 
 def solve(p: Problem, guess: Float[Array, "V W"]) -> Solution:
     """From a guess to the optimum, in at most `ITERATIONS` steps: all worlds take one together, and those that need more go on."""
-    r, g = spatial.combine(p.jacobian, guess) - p.reference, spatial.combine(p.mass, guess) - p.force
+    r, g = (
+        spatial.combine(p.jacobian, guess) - p.reference,
+        spatial.combine(p.mass, guess) - p.force,
+    )
     none = jnp.zeros(guess.shape[-1:], bool)
     state = _newton(p, _Iterate(guess, r, g, none, none.astype(jnp.int32)))
     state = jax.lax.platform_dependent(p, state, cpu=_finish_in_groups, default=_finish_together)
@@ -111,7 +114,9 @@ def _newton(p: Problem, s: _Iterate) -> _Iterate:
     return jax.tree.map(lambda old, new: jnp.where(s.done, old, new), s, new)
 
 
-def _line_search(slope0: Array, curvature: Array, stiffness: Array, r: Array, moves: Array, done: Array) -> Array:
+def _line_search(
+    slope0: Array, curvature: Array, stiffness: Array, r: Array, moves: Array, done: Array
+) -> Array:
     """The length that minimises the cost along a step: safeguarded Newton on its piecewise linear derivative.
 
     Nobody waits for worlds that are `done`, whose step is not taken. An accelerator takes all steps and asks for no result.
@@ -141,5 +146,7 @@ def _line_search(slope0: Array, curvature: Array, stiffness: Array, r: Array, mo
 
     one = jnp.ones_like(slope0)
     start = one, 0 * one, jnp.inf * one, 0 * one, 0
-    length = jax.lax.platform_dependent(start, cpu=lambda carry: jax.lax.while_loop(moving, refine, carry), default=written_out)[0]
+    length = jax.lax.platform_dependent(
+        start, cpu=lambda carry: jax.lax.while_loop(moving, refine, carry), default=written_out
+    )[0]
     return jnp.where(jnp.isfinite(length), length, 0)

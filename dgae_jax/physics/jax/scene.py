@@ -91,7 +91,9 @@ class Scene(NamedTuple):
 def known_bound(name: str, model: mujoco.MjModel) -> int | None:
     """The bound on contacts with the ground that is known for a model of this name; None where none is."""
     ground = [two for one, two in _pairs(model) if model.geom_type[one] == _PLANE]
-    return _CONTACTS.get((name, sum(2 if model.geom_type[two] == _CAPSULE else 1 for two in ground)))
+    return _CONTACTS.get(
+        (name, sum(2 if model.geom_type[two] == _CAPSULE else 1 for two in ground))
+    )
 
 
 def scene_of(tree: Tree, most: int | None = None) -> Scene:
@@ -99,12 +101,21 @@ def scene_of(tree: Tree, most: int | None = None) -> Scene:
     model = tree.model
     limited = np.flatnonzero(model.jnt_limited)
     weights = model.dof_invweight0[model.jnt_dofadr[limited]]
-    softness = _softness(model, model.jnt_margin[limited], weights, model.jnt_solref[limited], model.jnt_solimp[limited])
+    softness = _softness(
+        model,
+        model.jnt_margin[limited],
+        weights,
+        model.jnt_solref[limited],
+        model.jnt_solimp[limited],
+    )
     pairs: dict[tuple[bool, bool], list[tuple[int, int]]] = {}
     for one, two in _pairs(model):
         kind = bool(model.geom_type[one] == _PLANE), bool(max(model.geom_condim[[one, two]]) == 1)
         pairs.setdefault(kind, []).append((one, two))
-    groups = [_group(tree, np.array(p), ground, frictionless, most) for (ground, frictionless), p in pairs.items()]
+    groups = [
+        _group(tree, np.array(p), ground, frictionless, most)
+        for (ground, frictionless), p in pairs.items()
+    ]
     return Scene(limited, softness, groups)
 
 
@@ -114,16 +125,29 @@ def _pairs(model: mujoco.MjModel):
     for i, one in enumerate(geoms):
         for two in geoms[i + 1 :]:
             a, b = (weld[model.geom_bodyid[g]] for g in (one, two))
-            related = a and b and (weld[model.body_parentid[a]] == b or weld[model.body_parentid[b]] == a)
-            wanted = model.geom_contype[one] & model.geom_conaffinity[two] or model.geom_contype[two] & model.geom_conaffinity[one]
+            related = (
+                a and b and (weld[model.body_parentid[a]] == b or weld[model.body_parentid[b]] == a)
+            )
+            wanted = (
+                model.geom_contype[one] & model.geom_conaffinity[two]
+                or model.geom_contype[two] & model.geom_conaffinity[one]
+            )
             if a != b and not related and wanted:
                 yield int(one), int(two)
 
 
-def _group(tree: Tree, pairs: np.ndarray, ground: bool, frictionless: bool, most: int | None) -> Group:
+def _group(
+    tree: Tree, pairs: np.ndarray, ground: bool, frictionless: bool, most: int | None
+) -> Group:
     model = tree.model
     if ground:  # a capsule touches the ground with either end
-        tips = np.array([(*pair, sign) for pair in pairs for sign in ((1, -1) if model.geom_type[pair[1]] == _CAPSULE else (1,))])
+        tips = np.array(
+            [
+                (*pair, sign)
+                for pair in pairs
+                for sign in ((1, -1) if model.geom_type[pair[1]] == _CAPSULE else (1,))
+            ]
+        )
         pairs, second = tips[:, :2], _ends(tree, tips[:, 1])
         second = second._replace(centre=second.centre + tips[:, 2:] * second.half)
     else:
@@ -137,7 +161,9 @@ def _group(tree: Tree, pairs: np.ndarray, ground: bool, frictionless: bool, most
     solref, solimp = model.geom_solref[pairs].mean(1), model.geom_solimp[pairs].mean(1)
     softness = _softness(model, model.geom_margin[pairs].sum(1), weight, solref, solimp)
     moves = np.concatenate([np.zeros((1, model.nv)), tree.moves])[bodies]
-    normals = np.array([tree.bodies[0].at(np.zeros(3), model.geom_quat[g]).rotation[:, 2] for g in one])
+    normals = np.array(
+        [tree.bodies[0].at(np.zeros(3), model.geom_quat[g]).rotation[:, 2] for g in one]
+    )
     plane = np.c_[normals, (normals * model.geom_pos[one]).sum(1)]
     touching = Touching(softness, friction, moves[:, 1] - moves[:, 0], bodies)
     kept = min(len(pairs), most) if ground and most is not None else len(pairs)
@@ -146,13 +172,26 @@ def _group(tree: Tree, pairs: np.ndarray, ground: bool, frictionless: bool, most
 
 def _ends(tree: Tree, geoms: np.ndarray) -> Ends:
     model = tree.model
-    poses = [tree.bodies[model.geom_bodyid[g]].at(model.geom_pos[g], model.geom_quat[g]) for g in geoms]
+    poses = [
+        tree.bodies[model.geom_bodyid[g]].at(model.geom_pos[g], model.geom_quat[g]) for g in geoms
+    ]
     length = model.geom_size[geoms, 1] * (model.geom_type[geoms] == _CAPSULE)
     half = np.array([pose.rotation[:, 2] for pose in poses]) * length[:, None]
-    return Ends(np.array([pose.frame for pose in poses]), np.array([pose.position for pose in poses]), half, model.geom_size[geoms, 0])
+    return Ends(
+        np.array([pose.frame for pose in poses]),
+        np.array([pose.position for pose in poses]),
+        half,
+        model.geom_size[geoms, 0],
+    )
 
 
-def _softness(model: mujoco.MjModel, margin: np.ndarray, weight: np.ndarray, solref: np.ndarray, solimp: np.ndarray) -> Softness:
+def _softness(
+    model: mujoco.MjModel,
+    margin: np.ndarray,
+    weight: np.ndarray,
+    solref: np.ndarray,
+    solimp: np.ndarray,
+) -> Softness:
     """MuJoCo's stiffness and damping from `solref`, given as time constant and damping ratio or, negative, directly."""
     low, high, width, middle, power = solimp.T
     low, high, middle = (np.clip(x, mujoco.mjMINIMP, mujoco.mjMAXIMP) for x in (low, high, middle))
@@ -160,5 +199,7 @@ def _softness(model: mujoco.MjModel, margin: np.ndarray, weight: np.ndarray, sol
     safe = np.maximum(time, 2 * model.opt.timestep)
     stiffness = np.where(time > 0, 1 / (high * safe * ratio) ** 2, -time / high**2)
     damping = np.where(ratio > 0, 2 / (high * safe), -ratio / high)
-    impedance = np.stack([low, high, np.maximum(width, mujoco.mjMINVAL), middle, np.maximum(power, 1)], 1)
+    impedance = np.stack(
+        [low, high, np.maximum(width, mujoco.mjMINVAL), middle, np.maximum(power, 1)], 1
+    )
     return Softness(margin, weight, stiffness, damping, impedance)

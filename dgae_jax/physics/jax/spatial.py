@@ -44,7 +44,9 @@ def compose(a: Float[Array, "*#n M K #W"], b: Float[Array, "*#n K N #W"]) -> Arr
 
 def total(mask: np.ndarray, x: Float[Array, "n *k W"]) -> Float[Array, "m *k W"]:
     """Weighted sums along the first axis, as one product with a constant matrix m × n."""
-    return (jnp.asarray(mask, x.dtype) @ x.reshape(len(x), math.prod(x.shape[1:]))).reshape(len(mask), *x.shape[1:])
+    return (jnp.asarray(mask, x.dtype) @ x.reshape(len(x), math.prod(x.shape[1:]))).reshape(
+        len(mask), *x.shape[1:]
+    )
 
 
 def unit(x: Float[Array, "*n K W"]) -> Float[Array, "*n K W"]:
@@ -70,7 +72,11 @@ def rotate(quat: Float[Array, "4 W"], angle: Float[Array, "3 W"]) -> Float[Array
     half = 0.5 * jnp.sqrt(dot(angle, angle))
     w, xyz = jnp.cos(half), jnp.sin(half) * unit(angle)
     q = unit(quat)
-    return unit(jnp.concatenate([(q[0] * w - dot(q[1:], xyz))[None], q[0] * xyz + w * q[1:] + cross(q[1:], xyz)]))
+    return unit(
+        jnp.concatenate(
+            [(q[0] * w - dot(q[1:], xyz))[None], q[0] * xyz + w * q[1:] + cross(q[1:], xyz)]
+        )
+    )
 
 
 def solve(matrix: Float[Array, "V V W"], vector: Float[Array, "V W"]) -> Float[Array, "V W"]:
@@ -82,7 +88,9 @@ def solve(matrix: Float[Array, "V V W"], vector: Float[Array, "V W"]) -> Float[A
 
     def eliminate(rows, k):
         row = rows[k] / rows[k, k]
-        column = rows[:, k] - (jnp.arange(size)[:, None] == k)  # leaves the row itself divided by its pivot
+        column = rows[:, k] - (
+            jnp.arange(size)[:, None] == k
+        )  # leaves the row itself divided by its pivot
         return rows - column[:, None] * row, None
 
     def written_out(rows):
@@ -94,4 +102,6 @@ def solve(matrix: Float[Array, "V V W"], vector: Float[Array, "V W"]) -> Float[A
     def in_a_loop(rows):
         return jax.lax.scan(eliminate, rows, jnp.arange(size))[0][:, size]
 
-    return jax.lax.platform_dependent(jnp.concatenate([matrix, vector[:, None]], 1), cpu=in_a_loop, default=written_out)
+    return jax.lax.platform_dependent(
+        jnp.concatenate([matrix, vector[:, None]], 1), cpu=in_a_loop, default=written_out
+    )

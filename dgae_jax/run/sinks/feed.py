@@ -13,7 +13,7 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from dgae_jax.configs.config import Config
+from dgae_jax.configs.resolved import ResolvedConfig
 from dgae_jax.run import files, terminal
 from dgae_jax.run.evaluations import EvaluationsFile
 from dgae_jax.run.sinks import mlflow, tensorboard, wandb
@@ -44,7 +44,7 @@ PICTURES = ("curve.png", "film.mp4", "film.gif")
 class Feed:
     """The open sinks of one run; `done` are the samples of each run in its files so far. No function of it raises or waits but `close`."""
 
-    def __init__(self, names: tuple[str, ...], run_dir: Path, config: Config, done: int):
+    def __init__(self, names: tuple[str, ...], run_dir: Path, config: ResolvedConfig, done: int):
         self.run_dir, self.config = run_dir, config
         self.path = run_dir / "sinks.json"
         self.state = _read(self.path) if names else {}
@@ -82,7 +82,9 @@ class Feed:
         except Exception as reason:  # a library, a network and a disk may raise anything, and none of it is worth the run
             self.sinks.pop(name, None)
             why = f"{type(reason).__name__}: {reason}".strip().partition("\n")[0][:300]
-            terminal.warn(f"warning: --log {name} stops here ({why}); the training goes on, and --resume adds what is missing")
+            terminal.warn(
+                f"warning: --log {name} stops here ({why}); the training goes on, and --resume adds what is missing"
+            )
 
     def _open(self, name: str, done: int) -> None:
         noted, kind = self.state.setdefault(name, _noted({})), KINDS[name]
@@ -91,10 +93,18 @@ class Feed:
             noted |= {"rows": kept, "evaluations": min(kept, noted["evaluations"])}
         self.sinks[name] = kind.begin(Place(self.run_dir, self.config, noted["ids"], noted["rows"]))
         self._note()
-        known = (row for row, _ in files.whole_rows(self.run_dir / "metrics.jsonl") if row["steps"] <= done)
+        known = (
+            row
+            for row, _ in files.whole_rows(self.run_dir / "metrics.jsonl")
+            if row["steps"] <= done
+        )
         while chunk := list(itertools.islice(known, ITERATIONS * self.config.num_seeds)):
             self._give(name, "rows", chunk)
-        evaluated = (row for row in EvaluationsFile(self.run_dir / "evaluations.jsonl").rows if row["steps"] <= done)
+        evaluated = (
+            row
+            for row in EvaluationsFile(self.run_dir / "evaluations.jsonl").rows
+            if row["steps"] <= done
+        )
         self._give(name, "evaluations", list(evaluated))
 
     def _give(self, name: str, part: str, rows: list[Row]) -> None:
@@ -126,6 +136,13 @@ def _read(path: Path) -> dict[str, Any]:
 def _noted(found: Any) -> dict[str, Any]:
     found = found if isinstance(found, dict) else {}
     ids = found.get("ids")
-    known = {seed: each for seed, each in ids.items() if isinstance(each, str)} if isinstance(ids, dict) else {}
+    known = (
+        {seed: each for seed, each in ids.items() if isinstance(each, str)}
+        if isinstance(ids, dict)
+        else {}
+    )
     steps = {part: found.get(part) for part in ("rows", "evaluations")}
-    return {"ids": known, **{part: at if type(at) is int and at >= 0 else 0 for part, at in steps.items()}}
+    return {
+        "ids": known,
+        **{part: at if type(at) is int and at >= 0 else 0 for part, at in steps.items()},
+    }

@@ -29,18 +29,29 @@ def begin(place: Place) -> Sink:
 
     def write(seed: int, metrics: list[Any]) -> None:
         for first in range(0, len(metrics), BATCH):
-            client.log_batch(runs[seed].info.run_id, metrics=metrics[first : first + BATCH], synchronous=True)
+            client.log_batch(
+                runs[seed].info.run_id, metrics=metrics[first : first + BATCH], synchronous=True
+            )
 
     def rows(rows: list[Row]) -> None:
         for seed in runs:
             own = [row for row in rows if row["seed"] == seed]
             times = [started[seed] + round(1000 * row["seconds"]) for row in own]
-            write(seed, [Metric(k, x, at, row["steps"]) for row, at in zip(own, times, strict=True) for k, x in numbers(row).items()])
+            write(
+                seed,
+                [
+                    Metric(k, x, at, row["steps"])
+                    for row, at in zip(own, times, strict=True)
+                    for k, x in numbers(row).items()
+                ],
+            )
 
     def evaluations(rows: list[Row]) -> None:
         now = round(1000 * time.time())
         for row in rows:
-            write(row["seed"], [Metric(name, x, now, row["steps"]) for name, x in scores(row).items()])
+            write(
+                row["seed"], [Metric(name, x, now, row["steps"]) for name, x in scores(row).items()]
+            )
 
     def close(paths: list[Path], finished: bool) -> None:
         for run in runs.values():
@@ -62,7 +73,11 @@ def _experiment(client, run_dir: Path) -> str:
     """Of the name that MLFLOW_EXPERIMENT_NAME says; files lie in the run directory unless a server keeps them."""
     name = os.environ.get("MLFLOW_EXPERIMENT_NAME") or "dgae_jax"
     found = client.get_experiment_by_name(name)
-    own = None if os.environ.get("MLFLOW_TRACKING_URI") else (run_dir / "mlflow" / "files").resolve().as_uri()
+    own = (
+        None
+        if os.environ.get("MLFLOW_TRACKING_URI")
+        else (run_dir / "mlflow" / "files").resolve().as_uri()
+    )
     return found.experiment_id if found else client.create_experiment(name, artifact_location=own)
 
 
@@ -76,7 +91,12 @@ def _run(client, place: Place, seed: int):
     else:
         run = client.create_run(_experiment(client, place.run_dir), run_name=name_of(place, seed))
         place.ids[str(seed)] = known = run.info.run_id
-        client.log_batch(known, params=[Param(name, str(value)) for name, value in settings(place.config, seed).items()])
+        client.log_batch(
+            known,
+            params=[
+                Param(name, str(value)) for name, value in settings(place.config, seed).items()
+            ],
+        )
     run = client.get_run(known)
     _keep(client, place.run_dir, run, [place.run_dir / "config.json"])
     return run

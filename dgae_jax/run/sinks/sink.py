@@ -6,7 +6,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from dgae_jax.configs.config import Config
+from dgae_jax.configs.resolved import ResolvedConfig
 from dgae_jax.configs.serial import flat, to_dict
 
 Row = dict[str, Any]
@@ -17,7 +17,7 @@ class Place(NamedTuple):
     """What a sink is opened with."""
 
     run_dir: Path
-    config: Config
+    config: ResolvedConfig
     ids: dict[str, str]
     """By seed, how the viewer calls its run; empty at first, kept in the run directory from then on."""
     kept: int
@@ -35,7 +35,7 @@ class Sink(NamedTuple):
     """Take pictures and films, and end; told whether the run reached its end."""
 
 
-def seeds_of(config: Config) -> range:
+def seeds_of(config: ResolvedConfig) -> range:
     """The seeds that a run trains side by side: one run of the viewer each."""
     return range(config.seed, config.seed + config.num_seeds)
 
@@ -46,9 +46,13 @@ def name_of(place: Place, seed: int) -> str:
     return directory if place.config.num_seeds == 1 else f"{directory}-seed-{seed}"
 
 
-def settings(config: Config, seed: int) -> dict[str, Any]:
+def settings(config: ResolvedConfig, seed: int) -> dict[str, Any]:
     """What the run of one seed was configured by: values by path, those that are unset left out."""
-    return {path: value for path, value in flat(to_dict(dataclasses.replace(config, seed=seed))).items() if value is not None}
+    return {
+        path: value
+        for path, value in flat(to_dict(dataclasses.replace(config, seed=seed))).items()
+        if value is not None
+    }
 
 
 def numbers(row: Row) -> dict[str, float]:
@@ -62,4 +66,8 @@ def scores(row: Row) -> dict[str, float]:
 
 
 def _finite(values: dict[str, Any]) -> dict[str, float]:
-    return {name: float(value) for name, value in values.items() if value is not None and math.isfinite(value)}
+    return {
+        name: float(value)
+        for name, value in values.items()
+        if value is not None and math.isfinite(value)
+    }

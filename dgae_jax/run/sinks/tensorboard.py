@@ -16,13 +16,22 @@ def begin(place: Place) -> Sink:
     from tensorboardX.proto.summary_pb2 import Summary
     from tensorboardX.summary import text
 
-    writers = {seed: _writer(place.run_dir / "tensorboard" / f"seed_{seed}") for seed in seeds_of(place.config)}
+    writers = {
+        seed: _writer(place.run_dir / "tensorboard" / f"seed_{seed}")
+        for seed in seeds_of(place.config)
+    }
 
     def write(seed: int, **event) -> None:
         writers[seed].write_event(Event(wall_time=time.time(), **event))
 
     def scalars(seed: int, steps: int, values: dict[str, float]) -> None:
-        write(seed, step=steps, summary=Summary(value=[Summary.Value(tag=name, simple_value=x) for name, x in values.items()]))
+        write(
+            seed,
+            step=steps,
+            summary=Summary(
+                value=[Summary.Value(tag=name, simple_value=x) for name, x in values.items()]
+            ),
+        )
 
     def flush() -> None:
         for writer in writers.values():
@@ -39,7 +48,11 @@ def begin(place: Place) -> Sink:
         flush()
 
     def close(paths: list[Path], finished: bool) -> None:
-        images = [Summary.Value(tag=path.name, image=_image(path)) for path in paths if path.suffix == ".png"]
+        images = [
+            Summary.Value(tag=path.name, image=_image(path))
+            for path in paths
+            if path.suffix == ".png"
+        ]
         for seed, writer in writers.items():
             write(seed, summary=Summary(value=images))
             writer.close()
@@ -69,4 +82,10 @@ def _image(path: Path):
 
 
 def _table(values: dict) -> str:
-    return "\n".join(["| setting | value |", "|---|---|", *(f"| {name} | {value} |" for name, value in values.items())])
+    return "\n".join(
+        [
+            "| setting | value |",
+            "|---|---|",
+            *(f"| {name} | {value} |" for name, value in values.items()),
+        ]
+    )

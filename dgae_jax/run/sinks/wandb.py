@@ -54,7 +54,10 @@ def begin(place: Place) -> Sink:
 
     def close(paths: list[Path], finished: bool) -> None:
         for run in runs.values():
-            media = {path.name: (wandb.Image if path.suffix == ".png" else wandb.Video)(str(path)) for path in paths}
+            media = {
+                path.name: (wandb.Image if path.suffix == ".png" else wandb.Video)(str(path))
+                for path in paths
+            }
             if media:
                 run.log(media, step=2 * last[0] + 2)
             run.finish(exit_code=0 if finished else 1)
@@ -76,7 +79,10 @@ def _has_login(server: str) -> bool:
     """Whether there is a key in the environment or in ~/.netrc, where `wandb login` puts it."""
     from requests.utils import get_netrc_auth
 
-    return any(os.environ.get(name) for name in ("WANDB_API_KEY", "WANDB_IDENTITY_TOKEN_FILE")) or get_netrc_auth(server) is not None
+    return (
+        any(os.environ.get(name) for name in ("WANDB_API_KEY", "WANDB_IDENTITY_TOKEN_FILE"))
+        or get_netrc_auth(server) is not None
+    )
 
 
 def _answers(server: str) -> bool:
@@ -85,7 +91,9 @@ def _answers(server: str) -> bool:
 
     address = urlsplit(select_proxy(server, get_environ_proxies(server)) or server)
     try:
-        socket.create_connection((address.hostname, address.port or {"http": 80}.get(address.scheme, 443)), SECONDS).close()
+        socket.create_connection(
+            (address.hostname, address.port or {"http": 80}.get(address.scheme, 443)), SECONDS
+        ).close()
     except OSError:
         return False
     return True
