@@ -1,7 +1,7 @@
 """Generalized advantage estimation for distributional policy gradients, end to end in JAX.
 
-The public names are listed in `__init__.pyi` and imported when they are first used, so that a command line is checked before JAX
-is loaded.
+The public names are listed in `__init__.pyi` and imported when they are first used, so that a
+command line is checked before JAX is loaded.
 """
 
 import lazy_loader

@@ -1,8 +1,9 @@
 from .configs.config import Config, ConfigError, CriticConfig, NoiseConfig, PolicyConfig
 from .configs.presets import preset
+from .configs.resolved import ResolvedConfig, resolve
 from .envs.registry import make_env
 from .export.vector import make_vector_env
-from .learn.build import make_algorithm, make_train
+from .learn.build import make_algorithm, make_train, register
 from .maths.returns import (
     bellman_target,
     dgae,
@@ -37,6 +38,7 @@ __all__ = [
     "CriticConfig",
     "NoiseConfig",
     "PolicyConfig",
+    "ResolvedConfig",
     "Run",
     "RunError",
     "bellman_target",
@@ -62,6 +64,8 @@ __all__ = [
     "preset",
     "quantile_huber_loss",
     "quantile_midpoints",
+    "register",
+    "resolve",
     "sr_lambda_target",
     "td_residual",
     "train",

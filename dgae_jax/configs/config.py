@@ -57,12 +57,18 @@ class Settings:
         """
         config = self
         for path, value in settings.items():
+            if not config.has(path):
+                raise ConfigError(f"{path}: unknown setting", path)
             name, _, rest = path.partition(".")
-            if name not in {f.name for f in fields(config)}:  # pyright: ignore[reportArgumentType]
-                raise ConfigError(f"{path}: must be a setting of {type(config).__name__}")
             inner = getattr(config, name).replace(**{rest: value}) if rest else value
             config = dataclasses.replace(config, **{name: inner})  # pyright: ignore
         return config
+
+    def has(self, path: str) -> bool:
+        """Return whether there is a setting at a dotted path."""
+        name, _, rest = path.partition(".")
+        inner = vars(self).get(name)
+        return name in vars(self) and (not rest or isinstance(inner, Settings) and inner.has(rest))
 
 
 def floats_of(cls: type) -> list[str]:
@@ -220,7 +226,7 @@ class Config(CommonConfig):
             return  # `resolve` says so
         env, version = canonical_name(self.env)
         if version and self.env_version not in (None, version):
-            raise invalid("env_version", self.env_version, f"{version} as in {self.env}, or unset")
+            raise invalid("env_version", self.env_version, f"{version}, as in {self.env}, or unset")
         object.__setattr__(self, "env", env)
         object.__setattr__(self, "env_version", version or self.env_version)
         if isinstance(self.algo, str) and self.algo.lower() in ALGORITHMS:

@@ -4,7 +4,7 @@
 """
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 from dgae_jax.configs import validation
@@ -81,8 +81,8 @@ class ResolvedConfig(CommonConfig):
     algo: str
     residual: str
     physics: str
-    policy: ResolvedPolicy = field()
-    critic: ResolvedCritic = field()
+    policy: ResolvedPolicy
+    critic: ResolvedCritic
 
     @property
     def task(self) -> str:
@@ -139,10 +139,9 @@ def resolve(config: Config | ResolvedConfig, algo: str | None = None) -> Resolve
     update, kind = policy.update or row.policy_update, critic.kind or row.critic
     options = lookup("policy.update", update, UPDATES)
     shape = lookup("critic.kind", kind, CRITICS)
-    validation.check_unused(
-        f"{algo} with policy.update {update}", "policy", policy, options, UPDATES
-    )
-    validation.check_unused(f"{algo} with critic.kind {kind}", "critic", critic, shape, CRITICS)
+    used_by = f"{algo} (policy.update {update})"
+    validation.check_unused(used_by, "policy", policy, options, UPDATES)
+    validation.check_unused(f"{algo} (critic.kind {kind})", "critic", critic, shape, CRITICS)
     resolved = ResolvedConfig(
         **{name: getattr(config, name) for name in CommonConfig.__dataclass_fields__},
         env_version=config.env_version or spec.default_version,

@@ -194,7 +194,7 @@ def _check_metric(config: Config) -> None:
     allowed = f"mean with {config.algo}: other metrics need a distributional residual and quantiles"
     _require("metric", config.metric, used, allowed)
     ok = distribution or not config.diagnostics
-    _require("diagnostics", config.diagnostics, ok, f"off: the critic of {config.algo} is scalar")
+    _require("diagnostics", config.diagnostics, ok, "off: the critic is scalar")
 
 
 def _check_samples(config: Config) -> None:
