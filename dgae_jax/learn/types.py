@@ -4,7 +4,7 @@ Leading axes: T time steps of a rollout, N parallel envs, B = T·N flattened sam
 A action dimensions.
 """
 
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 from jaxtyping import Array, Bool, Float, Int, Key
 
@@ -82,18 +82,21 @@ class TrainState(NamedTuple):
     """Iterations in a row in which a non-finite update was skipped or most env steps were masked."""
 
 
+@runtime_checkable
 class Init(Protocol):
     """Initial parameters of a network."""
 
     def __call__(self, key: Key[Array, ""]) -> Params: ...
 
 
+@runtime_checkable
 class ApplyPolicy(Protocol):
     """Distribution over actions [..., A] in observations [..., O]."""
 
     def __call__(self, params: Params, obs: Float[Array, "*batch O"]) -> Gaussian: ...
 
 
+@runtime_checkable
 class Predict(Protocol):
     """Quantiles [..., K] of the return from observations [..., O]; K = 1 for a scalar critic."""
 
@@ -102,6 +105,7 @@ class Predict(Protocol):
     ) -> Float[Array, "*batch K"]: ...
 
 
+@runtime_checkable
 class TargetFn(Protocol):
     """Targets [T, N, J] of a critic's fit, from predictions of the critic at rollout time.
 
@@ -119,12 +123,14 @@ class TargetFn(Protocol):
     ) -> Float[Array, "T *N J"]: ...
 
 
+@runtime_checkable
 class Loss(Protocol):
     """Mean loss of a batch, and scalars worth logging."""
 
     def __call__(self, params: Params, batch: Any) -> tuple[Float[Array, ""], Metrics]: ...
 
 
+@runtime_checkable
 class Residual(Protocol):
     """TD error δ [T, N] from the predictions before and after a step: the part that DGAE changes."""
 
@@ -137,12 +143,14 @@ class Residual(Protocol):
     ) -> Float[Array, "T N"]: ...
 
 
+@runtime_checkable
 class InitOptimizer(Protocol):
     """State of an optimizer at the start."""
 
     def __call__(self, params: Params) -> Any: ...
 
 
+@runtime_checkable
 class UpdateStep(Protocol):
     """One iteration's update of a network, and scalars worth logging."""
 

@@ -159,7 +159,10 @@ def test_an_invalid_value_is_refused_with_what_is_allowed(path, value, allowed):
             "policy.clip_eps 0.1: must be unset: it has no effect with trpo",
         ),
         (Config(algo="ppo", metric="cvar:0.25"), "metric cvar:0.25: must be mean with ppo"),
-        (Config(algo="ppo", diagnostics=True), "diagnostics True: must be off: the critic is scalar"),
+        (
+            Config(algo="ppo", diagnostics=True),
+            "diagnostics True: must be off: the critic is scalar",
+        ),
         (Config(gamma="0.9"), "gamma: must be float, not '0.9'"),
         (Config(policy={"clip_eps": 0.1}), "policy .*: must be PolicyConfig"),
         (Config(policy=PolicyConfig(hidden=(8,) * 40)), "policy.hidden of 40 layers: must be"),
