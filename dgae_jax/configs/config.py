@@ -26,7 +26,7 @@ class ConfigError(ValueError):
 
 def invalid(setting: str, value: Any, allowed: str) -> ConfigError:
     """Return the error that says what a setting must be."""
-    shown = " ".join(map(str, value)) if isinstance(value, tuple) else value
+    shown = " ".join(map(str, value)) or "()" if isinstance(value, tuple) else value
     return ConfigError(f"{setting} {shown}: must be {allowed}", setting)
 
 
@@ -67,8 +67,10 @@ class Settings:
     def has(self, path: str) -> bool:
         """Return whether there is a setting at a dotted path."""
         name, _, rest = path.partition(".")
-        inner = vars(self).get(name)
-        return name in vars(self) and (not rest or isinstance(inner, Settings) and inner.has(rest))
+        if not rest:
+            return name in vars(self)
+        group = vars(self).get(name)
+        return isinstance(group, Settings) and group.has(rest)
 
 
 def floats_of(cls: type) -> list[str]:

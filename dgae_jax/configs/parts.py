@@ -40,9 +40,14 @@ CRITICS: dict[str, Defaults] = {
     "ordered": {"quantiles": 64, "kappa": 1e-4},
 }
 
-TARGETS: dict[str, Defaults] = dict.fromkeys(
-    ("bellman", "bellman-frozen", "lambda-shift", "sr-lambda", "lambda-return", "monte-carlo"), {}
-)
-RESIDUALS: dict[str, Defaults] = dict.fromkeys(("td", "distributional"), {})
-COVARIANCES: dict[str, Defaults] = dict.fromkeys(("shared", "state"), {})
-OPTIMIZERS: dict[str, Defaults] = dict.fromkeys(("adam", "rmsprop"), {})
+TARGETS: dict[str, Defaults] = {
+    "bellman": {},
+    "bellman-frozen": {},
+    "lambda-shift": {},
+    "sr-lambda": {},
+    "lambda-return": {},
+    "monte-carlo": {},
+}
+RESIDUALS: dict[str, Defaults] = {"td": {}, "distributional": {}}
+COVARIANCES: dict[str, Defaults] = {"shared": {}, "state": {}}
+OPTIMIZERS: dict[str, Defaults] = {"adam": {}, "rmsprop": {}}

@@ -86,11 +86,10 @@ def check_types(settings: Settings, prefix: str = "") -> None:
             if not isinstance(value, kind):  # pyright: ignore[reportArgumentType]
                 raise ConfigError(f"{path} {value!r}: must be {kind.__name__}", path)
             check_types(value, f"{path}.")
-        elif value is not None or type(None) not in get_args(kind):
-            if not (hasattr(value, "dtype") or _has_type(value, _plain(kind))):
-                kind = _plain(kind)
-                shown = getattr(get_origin(kind) or kind, "__name__", kind)
-                raise ConfigError(f"{path}: must be {shown}, not {value!r}", path)
+        elif not _has_type(value, kind):
+            plain = _plain(kind)
+            shown = getattr(get_origin(plain) or plain, "__name__", plain)
+            raise ConfigError(f"{path}: must be {shown}, not {value!r}", path)
 
 
 def _plain(kind: Any) -> Any:
@@ -101,6 +100,11 @@ def _plain(kind: Any) -> Any:
 
 
 def _has_type(value: Any, kind: Any) -> bool:
+    if value is None:
+        return type(None) in get_args(kind)
+    if hasattr(value, "dtype"):
+        return True
+    kind = _plain(kind)
     if get_origin(kind) is tuple:
         return isinstance(value, tuple) and all(type(each) is int for each in value)
     return type(value) is kind

@@ -79,7 +79,7 @@ class TrainState(NamedTuple):
     key: Key[Array, ""]
     iteration: Int[Array, ""]
     failures: Int[Array, ""]
-    """Iterations in a row in which a non-finite update was skipped or most env steps were masked."""
+    """Iterations in a row with a skipped update, or with most env steps masked."""
 
 
 @runtime_checkable
@@ -132,7 +132,7 @@ class Loss(Protocol):
 
 @runtime_checkable
 class Residual(Protocol):
-    """TD error δ [T, N] from the predictions before and after a step: the part that DGAE changes."""
+    """TD error δ from the predictions before and after each step: the part that DGAE changes."""
 
     def __call__(
         self,
@@ -167,7 +167,7 @@ class Policy(NamedTuple):
 
 
 class Critic(NamedTuple):
-    """A value distribution: its prediction, the target it is fitted to, and the loss between them."""
+    """A value distribution: its prediction, the target of its fit, and the loss between them."""
 
     init: Init
     predict: Predict

@@ -1,9 +1,14 @@
+"""Rollouts: time limits and ends, true successors, fresh episodes, masks."""
+
+from functools import cache
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
+from dgae_jax.learn.play import begin, play
 from dgae_jax.learn.rollout import rollout, start
 from tests.probes import Counter, Fragile
 
@@ -12,55 +17,52 @@ def act(key, obs):
     return jnp.full((*obs.shape[:-1], 1), 3.0), jnp.zeros(obs.shape[:-1])
 
 
-def run(env, key, *, worlds=4, num_steps=12, episode_length=5):
+def run(env, key, *, num_envs=4, num_steps=12, episode_length=5, act=act):
     start_key, key = jax.random.split(key)
-    return rollout(
-        env,
-        act,
-        begin(env, start_key, worlds),
-        jax.random.split(key, (num_steps, worlds)),
-        episode_length=episode_length,
-    )
+    episodes = start(env, jax.random.split(start_key, num_envs))
+    keys = jax.random.split(key, (num_steps, num_envs))
+    return rollout(env, act, episodes, keys, episode_length=episode_length)
 
 
-def begin(env, key, worlds):
-    return start(env, jax.random.split(key, worlds))
+@cache
+def counter():
+    """12 steps in 4 envs, with a time limit of 5."""
+    return run(Counter(), jax.random.key(0))
 
 
-def test_a_time_limit_truncates_and_never_terminates(key):
-    _, step = run(Counter(), key)
+def all_finite(tree):
+    return all(np.isfinite(x).all() for x in tree)
+
+
+def test_a_time_limit_truncates():
+    _, step = counter()
     assert not step.terminated.any()
     assert_array_equal(np.flatnonzero(step.truncated[:, 0]), [4, 9])
 
 
-def test_the_end_of_the_task_terminates_and_never_truncates_even_on_the_last_step_allowed(key):
+def test_the_end_of_the_task_terminates_even_at_the_time_limit(key):
     _, step = run(Counter(length=5), key, episode_length=5)
     assert not step.truncated.any()
     assert_array_equal(np.flatnonzero(step.terminated[:, 0]), [4, 9])
 
 
-def test_the_successor_at_an_episodes_end_is_where_it_ended_not_the_reset_observation(key):
-    _, step = run(Counter(), key)
-    assert_array_equal(step.next_obs[4, :, 0], 5)
-    assert_array_equal(step.obs[5, :, 0], 0)
+def test_next_obs_is_the_true_successor():
+    _, step = counter()
+    continues = ~np.asarray(step.truncated)[:-1]
+    following = np.asarray(step.obs)[1:]
+    assert_array_equal(np.asarray(step.next_obs)[:-1][continues], following[continues])
+    assert_array_equal(step.next_obs[4, :, 0], 5)  # where the episode ended, not the reset
     assert_array_equal(step.next_obs[4, :, 1], step.obs[4, :, 1])
+    assert_array_equal(step.obs[5, :, 0], 0)
 
 
-def test_every_episode_starts_afresh(key):
-    _, step = run(Counter(), key)
+def test_every_episode_starts_from_a_random_state_of_its_own():
+    _, step = counter()
     starts = np.asarray(step.obs[[0, 5, 10], :, 1]).ravel()
     assert len(set(starts.tolist())) == 12
 
 
-def test_within_an_episode_the_successor_is_the_next_observation(key):
-    _, step = run(Counter(), key)
-    continues = ~np.asarray(step.truncated)[:-1]
-    assert_array_equal(
-        np.asarray(step.next_obs)[:-1][continues], np.asarray(step.obs)[1:][continues]
-    )
-
-
-def test_episode_returns_are_undiscounted_sums_and_unknown_before_the_first_end(key):
+def test_episode_returns_are_undiscounted_and_nan_before_the_first_end(key):
     episodes, _ = run(Counter(), key, num_steps=4)
     assert jnp.isnan(episodes.last_total).all()
     episodes, _ = run(Counter(), key, num_steps=7)
@@ -70,95 +72,96 @@ def test_episode_returns_are_undiscounted_sums_and_unknown_before_the_first_end(
     assert_array_equal(episodes.steps, 2)
 
 
-def test_two_rollouts_in_a_row_are_one_long_rollout_in_episode_time(key):
-    first, second = jax.random.split(key)
-    env = Counter()
-    episodes, a = rollout(
-        env, act, begin(env, key, 3), jax.random.split(first, (7, 3)), episode_length=5
-    )
-    _, b = rollout(env, act, episodes, jax.random.split(second, (5, 3)), episode_length=5)
-    assert_array_equal(jnp.concatenate([a.reward, b.reward])[:, 0], [1, 2, 3, 4, 5] * 2 + [1, 2])
+def test_episodes_continue_from_one_rollout_to_the_next(key):
+    episodes, first = run(Counter(), key, num_steps=7)
+    keys = jax.random.split(key, (5, 4))
+    _, second = rollout(Counter(), act, episodes, keys, episode_length=5)
+    reward = jnp.concatenate([first.reward, second.reward])[:, 0]
+    assert_array_equal(reward, [1, 2, 3, 4, 5] * 2 + [1, 2])
 
 
-def test_actions_are_clipped_before_they_act_and_recorded_as_sampled(key):
-    episodes, step = run(Counter(), key)
+def test_actions_are_clipped_before_they_act_and_recorded_as_sampled():
+    episodes, step = counter()
     assert_array_equal(step.action, 3.0)
     assert_array_equal(episodes.env.metrics["action"][0], 1.0)
 
 
 @pytest.mark.parametrize("value", [jnp.nan, jnp.inf])
 @pytest.mark.parametrize("part", ["pipeline_state", "reward", "obs"])
-def test_a_world_that_turns_non_finite_ends_terminated_without_reward_and_starts_afresh(
-    part, value, key
-):
-    episodes, step = run(Fragile(value, part), key, worlds=16, num_steps=4, episode_length=100)
+def test_a_non_finite_env_is_masked_and_starts_afresh(part, value, key):
+    env = Fragile(value, part)
+    episodes, step = run(env, key, num_envs=16, num_steps=4, episode_length=100)
     broken = np.asarray(step.obs[0, :, 1] < 0.5)
     assert 0 < broken.sum() < 16
+    assert_array_equal(step.mask[2], ~broken)
     assert_array_equal(step.terminated[2], broken)
     assert_array_equal(step.reward[2], np.where(broken, 0, 3))
     assert_array_equal(step.obs[3, :, 0], np.where(broken, 0, 3))
     assert_array_equal(episodes.last_total, np.where(broken, 1 + 2, np.nan))
     assert int(episodes.nonfinite.sum()) == broken.sum()
-    assert all(np.isfinite(x).all() for x in step)
-    assert all(
-        np.isfinite(x).all() for x in (episodes.env.obs, episodes.env.reward, episodes.total)
-    )
+    assert all_finite(step)
+    assert all_finite((episodes.env.obs, episodes.env.reward, episodes.total))
+    _, action = episodes.incident  # of the last masked step
+    assert_array_equal(action[:, 0], np.where(broken, 3, 0))
 
 
-def test_a_non_finite_action_is_contained_too(key):
+def test_a_non_finite_action_is_masked_too(key):
     def sometimes(key, obs):
         action = jnp.where((obs[:, :1] == 2) & (obs[:, 1:] < 0.5), jnp.nan, 0.5)
         return action, action[:, 0]
 
-    start_key, key = jax.random.split(key)
-    episodes, step = rollout(
-        Counter(),
-        sometimes,
-        begin(Counter(), start_key, 16),
-        jax.random.split(key, (4, 16)),
-        episode_length=100,
-    )
+    options = {"num_envs": 16, "num_steps": 4, "episode_length": 100}
+    episodes, step = run(Counter(), key, act=sometimes, **options)
     assert 0 < int(episodes.nonfinite.sum()) == int(step.terminated[2].sum()) < 16
-    assert all(np.isfinite(x).all() for x in step)
+    assert all_finite(step)
     assert_array_equal(jnp.isnan(episodes.incident[1][:, 0]), episodes.nonfinite > 0)
 
 
-def test_a_state_broken_from_outside_reaches_no_step(key):
-    episodes = begin(Counter(), key, 4)
+def test_a_state_that_is_non_finite_at_the_start_is_masked(key):
+    episodes = start(Counter(), jax.random.split(key, 4))
     broken = episodes._replace(env=episodes.env.replace(obs=episodes.env.obs.at[1].set(jnp.nan)))
-    episodes, step = rollout(
-        Counter(), act, broken, jax.random.split(key, (3, 4)), episode_length=100
-    )
-    assert all(np.isfinite(x).all() for x in step)
+    keys = jax.random.split(key, (3, 4))
+    episodes, step = rollout(Counter(), act, broken, keys, episode_length=100)
+    assert all_finite(step)
     assert_array_equal(step.terminated[0], [False, True, False, False])
     assert int(episodes.nonfinite.sum()) == 1
 
 
-def test_the_incident_of_a_world_is_the_state_before_and_the_action(key):
-    episodes, _ = run(Fragile(jnp.nan, "reward"), key, worlds=16, num_steps=3, episode_length=100)
-    state, action = episodes.incident
-    broken = np.asarray(episodes.nonfinite) == 1
-    assert 0 < broken.sum() < 16
-    assert_array_equal(action[:, 0], np.where(broken, 3, 0))
-    assert_array_equal(state, 0)
-    healthy, _ = run(Counter(), key)
-    assert int(healthy.nonfinite.sum()) == 0
-
-
-def test_what_happens_in_a_world_depends_on_its_own_keys_alone(key):
+def test_an_env_depends_on_its_own_keys_alone(key):
     def drawn(keys, obs):
         return jax.vmap(jax.random.normal, (0, None))(keys, (1,)), jnp.zeros(len(keys))
 
     start_keys, keys = jax.random.split(key, 6), jax.random.split(key, (7, 6))
-    whole, all_steps = rollout(
-        Counter(), drawn, start(Counter(), start_keys), keys, episode_length=5
-    )
-    half, steps = rollout(
-        Counter(), drawn, start(Counter(), start_keys[3:]), keys[:, 3:], episode_length=5
-    )
-    jax.tree.map(
-        lambda a, b: assert_array_equal(a[3:], b),
-        whole._replace(incident=()),
-        half._replace(incident=()),
-    )
+
+    def run(chosen):
+        episodes = start(Counter(), start_keys[chosen])
+        return rollout(Counter(), drawn, episodes, keys[:, chosen], episode_length=5)
+
+    (whole, all_steps), (half, steps) = run(slice(None)), run(slice(3, None))
+    whole, half = (x._replace(incident=()) for x in (whole, half))
+    jax.tree.map(lambda a, b: assert_array_equal(a[3:], b), whole, half)
     jax.tree.map(lambda a, b: assert_array_equal(a[:, 3:], b), all_steps, steps)
+
+
+# ---- episodes that are only watched ----
+
+
+def watched(env, key, limits):
+    episodes = begin(jax.vmap(env.reset)(jax.random.split(key, 6)))
+    for until in limits:
+        episodes = play(env, lambda obs: jnp.zeros((*obs.shape[:-1], 1)), episodes, until)
+    return episodes
+
+
+def test_play_sums_each_episode_until_its_own_end(key):
+    after = watched(Counter(length=3), key, [100])  # pays 1, 2, 3
+    assert_allclose(after.total, [6.0] * 6)
+    assert not after.alive.any()
+    assert int(after.step) == 3
+
+
+@pytest.mark.parametrize("limits", [[4], [1, 2, 3, 4], [3, 4]])
+def test_play_in_chunks_of_any_size_is_the_same(limits, key):
+    after = watched(Counter(), key, limits)
+    assert_allclose(after.total, [1.0 + 2 + 3 + 4] * 6)
+    assert after.alive.all()
