@@ -27,7 +27,7 @@ from dgae_jax.learn.critics import SR_LAMBDA, quantile
 from dgae_jax.learn.types import Batch, Critic, Params
 from dgae_jax.maths.statistics import crps
 from dgae_jax.maths.transport import monotone_quantiles, quantile_huber_loss
-from dgae_jax.run import machine
+from dgae_jax.run import runtime
 from dgae_jax.run.calibration import calibrate
 
 Quantiles = Float[Array, "*batch K"]
@@ -166,7 +166,9 @@ def main() -> None:
             known[which] = row(*which)
             if file:
                 file.write_text(
-                    json.dumps({"machine": machine.facts(), "rows": list(known.values())}, indent=1)
+                    json.dumps(
+                        {"machine": runtime.hardware(), "rows": list(known.values())}, indent=1
+                    )
                     + "\n"
                 )
         found, (task, critic, seed, _) = known[which], which

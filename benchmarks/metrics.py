@@ -11,7 +11,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter
 
-from dgae_jax.run import curve, files, metrics
+from dgae_jax.run import files, metrics
 
 ROWS = 200
 """Most rows of the source of a picture."""
@@ -52,7 +52,7 @@ def draw(path: Path) -> None:
         axes.xaxis.set_major_formatter(EngFormatter(sep=""))
         axes.margins(x=0.01)
     figure.supxlabel("environment steps", fontsize=9)
-    curve.save(figure, path.with_suffix(".png"))
+    metrics.save_figure(figure, path.with_suffix(".png"))
 
 
 if __name__ == "__main__":

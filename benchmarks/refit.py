@@ -14,9 +14,8 @@ from tempfile import TemporaryDirectory
 from dgae_jax.cli.arguments import parse
 from dgae_jax.report import calibration as picture
 from dgae_jax.report.results import Row, read
-from dgae_jax.run import curve, directory, machine, restore
-from dgae_jax.run.calibration import calibrate
-from dgae_jax.run.refit import refit
+from dgae_jax.run import checkpoint, directory, metrics, runtime
+from dgae_jax.run.calibration import calibrate, refit
 
 
 @dataclass(frozen=True)
@@ -45,7 +44,7 @@ def row(study: Path, cell: Row) -> dict:
             refit(source, directory.config_of(source), which="latest"),
             Path(place) / source.name,
         )
-        restore.save_networks(file, made.config, made.networks, made.std)
+        checkpoint.save_networks(file, made.config, made.networks, made.std)
         found = calibrate(file, made.config, which="latest")
     about = {
         "task": cell.env,
@@ -69,7 +68,9 @@ def main() -> None:
             known[name] = row(arguments.study, cells[name])
             if file:
                 file.write_text(
-                    json.dumps({"machine": machine.facts(), "rows": list(known.values())}, indent=1)
+                    json.dumps(
+                        {"machine": runtime.hardware(), "rows": list(known.values())}, indent=1
+                    )
                     + "\n"
                 )
         shown[name.removesuffix(".msgpack")] = (which[1], known[name])
@@ -78,7 +79,7 @@ def main() -> None:
             flush=True,
         )
     if arguments.picture:
-        curve.save(picture.histograms(shown), arguments.picture)
+        metrics.save_figure(picture.histograms(shown), arguments.picture)
 
 
 if __name__ == "__main__":

@@ -18,7 +18,7 @@ from throughput import iteration, setting
 from dgae_jax.cli.arguments import parse
 from dgae_jax.configs.config import Config
 from dgae_jax.physics.cores import cores
-from dgae_jax.run import machine
+from dgae_jax.run import runtime
 
 
 @dataclass(frozen=True)
@@ -85,7 +85,7 @@ def main() -> None:
         print(f"{task:7s} {algo:5s} {physics:6s} {together:12,.0f} {apart:15,.0f}", flush=True)
     if arguments.json:
         arguments.json.write_text(
-            json.dumps({"machine": machine.facts(), "rows": rows}, indent=1) + "\n"
+            json.dumps({"machine": runtime.hardware(), "rows": rows}, indent=1) + "\n"
         )
 
 

@@ -40,7 +40,7 @@ from dgae_jax.learn.iteration import _estimate, _roll_out, acting, nothing
 from dgae_jax.learn.parallel import COMPILER_OPTIONS
 from dgae_jax.learn.types import InferenceState
 from dgae_jax.physics.cores import cores
-from dgae_jax.run import machine
+from dgae_jax.run import runtime
 from dgae_jax.run.options import RunOptions
 
 
@@ -120,7 +120,7 @@ class Iteration(NamedTuple):
 def iteration(config: Config, seconds: float) -> Iteration:
     """From nothing to the first iteration, then as many iterations as fit, one per call."""
     jax.config.update("jax_enable_compilation_cache", False)
-    count = machine.use_devices(config, RunOptions())
+    count = runtime.use_devices(config, RunOptions())
     began = time.perf_counter()
     trainer = make_trainer(make_task(config), 1, devices.make_mesh(count))
     state = trainer.init(config, seed_keys(config))
@@ -303,7 +303,7 @@ def main() -> None:
             flush=True,
         )
     if arguments.json:
-        facts = {**machine.facts(), "jax": jax.__version__}
+        facts = {**runtime.hardware(), "jax": jax.__version__}
         found = {
             "machine": facts,
             "ours": [dataclasses.asdict(r) for r in rows],

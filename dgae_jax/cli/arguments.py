@@ -16,7 +16,7 @@ from dgae_jax.cli import mistakes
 from dgae_jax.cli.flags import Leaf, built, leaves, view
 from dgae_jax.cli.spelling import refuse_foreign
 from dgae_jax.configs.config import ConfigError, flag
-from dgae_jax.run import compiling, terminal
+from dgae_jax.run import terminal
 
 T = TypeVar("T")
 
@@ -36,7 +36,8 @@ def fail(mistake: Exception | str) -> NoReturn:
 def stopped(why: str) -> int:
     """Say why a command ends after SIGINT; 130. The process ends here where a compiler was left to itself, which would abort it."""
     terminal.warn(why)
-    if compiling.is_running():
+    runtime = sys.modules.get("dgae_jax.run.runtime")  # imported by now if JAX compiles
+    if runtime and runtime.is_compiling():
         os._exit(130)
     return 130
 

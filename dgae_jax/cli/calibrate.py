@@ -83,13 +83,13 @@ def _checked(arguments: Arguments) -> tuple[dict[Path, ResolvedConfig], Path]:
 
 def _calibrate(arguments: Arguments, runs: dict[Path, ResolvedConfig], out: Path) -> int:
     from dgae_jax.report import calibration as picture
-    from dgae_jax.run import calibration, curve, machine, outcomes
-    from dgae_jax.run.progress import Reporter
+    from dgae_jax.run import calibration, metrics, runtime
+    from dgae_jax.run.terminal import Reporter
 
-    machine.use_devices(next(iter(runs.values())), RunOptions(devices=1, num_processes=1))
-    machine.use_cache(arguments.cache_dir)
+    runtime.use_devices(next(iter(runs.values())), RunOptions(devices=1, num_processes=1))
+    runtime.use_cache(arguments.cache_dir)
     for config in runs.values():
-        outcomes.check(config)
+        calibration.check_returns(config)
     found, how = (
         {},
         {"which": arguments.checkpoint, "index": arguments.index, "seed": arguments.seed},
@@ -102,7 +102,7 @@ def _calibrate(arguments: Arguments, runs: dict[Path, ResolvedConfig], out: Path
             f"{path.resolve().name}: {picture.held(result)}, "
             f"{100 * result['crossing']:.0f} % of neighbours cross, rmse {result['rmse']:.3f}, spread {result['spread']:.3f}"
         )
-    _write(out, lambda to: curve.save(picture.histograms(found), to))
+    _write(out, lambda to: metrics.save_figure(picture.histograms(found), to))
     statistics = {name: result for name, (_, result) in found.items()}
     _write(out.with_suffix(".json"), lambda to: files.write_json(to, statistics))
     terminal.say(f"written {out} and {out.with_suffix('.json').name}")

@@ -15,12 +15,12 @@ from dgae_jax.configs.presets import PRESETS
 from dgae_jax.configs.validation import CHOICES, task_spec
 from dgae_jax.envs.registry import TASKS
 from dgae_jax.physics.registry import ENGINES
-from dgae_jax.run.options import SINKS
+from dgae_jax.run.options import METRIC_LOGGERS
 from dgae_jax.study.launch import LAUNCHERS
 
 NAMES = {
     "preset": PRESETS, "env": TASKS, "envs": TASKS, "env_version": task_spec(Config()).versions, "algo": ALGORITHMS, "algos": ALGORITHMS,
-    "physics": ENGINES, "policy.update": UPDATES, "critic.kind": CRITICS, "log": SINKS, "launcher": LAUNCHERS, **CHOICES,
+    "physics": ENGINES, "policy.update": UPDATES, "critic.kind": CRITICS, "log": METRIC_LOGGERS, "launcher": LAUNCHERS, **CHOICES,
 }  # fmt: skip
 """Settings that take a name, and the table that it is of."""
 

@@ -14,8 +14,7 @@ from dgae_jax.cli.arguments import fail, parse, stopped
 from dgae_jax.cli.source import check_file, check_seed
 from dgae_jax.configs.config import ConfigError, invalid
 from dgae_jax.run import directory, files, terminal
-from dgae_jax.run.engines import engine_of
-from dgae_jax.run.options import WHOLE, RunOptions
+from dgae_jax.run.options import INTEGER_RANGES, RunOptions, engine_of
 
 PURPOSE = "Evaluate the deterministic policy of a trained run."
 
@@ -63,7 +62,7 @@ def main() -> int:
 
 def _check(arguments: Arguments) -> None:
     """Raise ConfigError for the first argument that is invalid."""
-    low, high, reason = WHOLE["episodes"]
+    low, high, reason = INTEGER_RANGES["episodes"]
     if not low <= arguments.episodes <= high:
         raise invalid(
             "episodes", arguments.episodes, f"a whole number from {low:,} to {high:,} ({reason})"
@@ -73,15 +72,15 @@ def _check(arguments: Arguments) -> None:
 
 def _evaluate(arguments: Arguments) -> int:
     config = directory.config_of(arguments.run_dir)
-    from dgae_jax.run import evaluation, machine
-    from dgae_jax.run.progress import Reporter
-    from dgae_jax.run.summary import describe
+    from dgae_jax.run import evaluation, runtime
+    from dgae_jax.run.evaluation import describe
+    from dgae_jax.run.terminal import Reporter
 
     engine = engine_of(config, arguments.engine)
     out = arguments.out or evaluation.default_path(arguments.run_dir, engine, arguments.checkpoint)
     check_file(out)
-    machine.use_devices(config, RunOptions(devices=1, num_processes=1))
-    machine.use_cache(arguments.cache_dir)
+    runtime.use_devices(config, RunOptions(devices=1, num_processes=1))
+    runtime.use_cache(arguments.cache_dir)
     how = {
         "which": arguments.checkpoint,
         "engine": engine,

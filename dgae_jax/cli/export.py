@@ -78,9 +78,9 @@ def _checked(arguments: Arguments) -> tuple[ResolvedConfig, Path]:
 
 def _export(arguments: Arguments, config: ResolvedConfig, out: Path) -> int:
     from dgae_jax.export import bundle
-    from dgae_jax.run import machine
+    from dgae_jax.run import runtime
 
-    machine.use_devices(config, RunOptions(devices=1, num_processes=1))
+    runtime.use_devices(config, RunOptions(devices=1, num_processes=1))
     formats = list(dict.fromkeys(arguments.to))
     try:
         written = bundle.export(

@@ -81,11 +81,11 @@ def _checked(arguments: Arguments) -> tuple[ResolvedConfig, Path]:
 
 
 def _refit(arguments: Arguments, config: ResolvedConfig, out: Path) -> int:
-    from dgae_jax.run import machine, refit, restore
-    from dgae_jax.run.progress import Reporter
+    from dgae_jax.run import calibration, checkpoint, runtime
+    from dgae_jax.run.terminal import Reporter
 
-    machine.use_devices(config, RunOptions(devices=1, num_processes=1))
-    machine.use_cache(arguments.cache_dir)
+    runtime.use_devices(config, RunOptions(devices=1, num_processes=1))
+    runtime.use_cache(arguments.cache_dir)
     how = {
         "which": arguments.checkpoint,
         "index": arguments.index,
@@ -93,9 +93,9 @@ def _refit(arguments: Arguments, config: ResolvedConfig, out: Path) -> int:
         "worlds": arguments.worlds,
     }
     with Reporter() as reporter:
-        found = refit.refit(arguments.run_dir, config, **how, watch=reporter.watch)
+        found = calibration.refit(arguments.run_dir, config, **how, watch=reporter.watch)
     try:
-        restore.save_networks(out, found.config, found.networks, found.std)
+        checkpoint.save_networks(out, found.config, found.networks, found.std)
     except OSError as reason:
         raise invalid("out", out, f"a file that can be written ({reason.strerror})") from reason
     terminal.say(

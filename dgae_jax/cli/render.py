@@ -156,11 +156,11 @@ def _titles(paths: list[Path]) -> list[str]:
 
 def _render(arguments: Arguments, configs: list[ResolvedConfig]) -> int:
     from dgae_jax.export import episodes, film
-    from dgae_jax.run import machine
-    from dgae_jax.run.progress import Reporter
+    from dgae_jax.run import runtime
+    from dgae_jax.run.terminal import Reporter
 
-    machine.use_devices(configs[0], RunOptions(devices=1, num_processes=1))
-    machine.use_cache(arguments.cache_dir)
+    runtime.use_devices(configs[0], RunOptions(devices=1, num_processes=1))
+    runtime.use_cache(arguments.cache_dir)
     shots = episodes.Shots(arguments.episodes, arguments.seed, arguments.seconds)
     paths = [arguments.run_dir, *arguments.compare]
     if arguments.during:

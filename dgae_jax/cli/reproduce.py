@@ -20,7 +20,7 @@ from dgae_jax.configs.resolved import ResolvedConfig
 from dgae_jax.configs.validation import lookup, task_spec
 from dgae_jax.envs.registry import TASKS
 from dgae_jax.run import terminal
-from dgae_jax.run.options import RunOptions, to_dict
+from dgae_jax.run.options import RunOptions, saved_options
 from dgae_jax.study import matrix
 from dgae_jax.study.launch import LaunchOptions, launcher
 from dgae_jax.study.variants import VARIANTS
@@ -176,7 +176,7 @@ def _refuse(config: ResolvedConfig, options: RunOptions, task: str, algo: str) -
         )
     for name, usual in dataclasses.asdict(RunOptions(devices=options.devices)).items():
         value = getattr(options, name)
-        if value != usual and name != "cache_dir" and name not in to_dict(options):
+        if value != usual and name != "cache_dir" and name not in saved_options(options):
             raise invalid(name, value, "left out: it is of one run alone")
 
 

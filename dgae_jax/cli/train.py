@@ -15,7 +15,7 @@ from dgae_jax.cli.spelling import understood
 from dgae_jax.configs.config import Config, ConfigError, invalid
 from dgae_jax.configs.presets import preset
 from dgae_jax.configs.resolved import ResolvedConfig, resolve
-from dgae_jax.run import directory, manifest, terminal
+from dgae_jax.run import directory, terminal
 from dgae_jax.run.options import RunOptions, validate_options
 
 PURPOSE = "Train a policy with PPO, TRPO, A2C or a distributional variant of them."
@@ -52,16 +52,9 @@ def main() -> int:
     terminal.prepare()
     try:
         config, options = parsed(sys.argv[1:])
-        from dgae_jax.run import loop
+        from dgae_jax.run import training
 
-        work = (
-            loop.resume_or_start
-            if options.resume_or_start
-            else loop.resume
-            if options.resume
-            else loop.train
-        )
-        return work(config, options)
+        return training.train_command(config, options)
     except ConfigError as mistake:
         fail(mistake)
     except KeyboardInterrupt:
@@ -75,7 +68,7 @@ def parsed(argv: list[str]) -> tuple[ResolvedConfig, RunOptions]:
     for name in (name for name, value in given.items() if value == ""):
         raise ConfigError(f"{name}: must be followed by a value", name)
     config = _start(given)
-    options = manifest.options(Path(given["resume"])) if given["resume"] else RunOptions()
+    options = directory.saved_options(Path(given["resume"])) if given["resume"] else RunOptions()
     arguments = parse(
         Arguments, PURPOSE, argv, Arguments(settings=config, run=options), EXAMPLES, NOTE
     )

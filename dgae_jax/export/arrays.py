@@ -20,9 +20,9 @@ from dgae_jax.learn.build import make_task
 from dgae_jax.learn.normalizers import OBSERVATION_LIMIT
 from dgae_jax.maths.transport import GAP_BIAS, centered_cumsum
 from dgae_jax.run.api import Policy
-from dgae_jax.run.engines import referee
+from dgae_jax.run.checkpoint import Networks
 from dgae_jax.run.evaluation import time_limit
-from dgae_jax.run.restore import Trained
+from dgae_jax.run.options import eval_env_id
 
 Arrays = dict[str, np.ndarray]
 
@@ -30,7 +30,7 @@ TOLERANCE = 1e-4
 """Largest difference between the arrays' outputs and those of the policy itself, absolute and relative."""
 
 
-def arrays_of(found: Trained, config: ResolvedConfig, index: int) -> Arrays:
+def arrays_of(found: Networks, config: ResolvedConfig, index: int) -> Arrays:
     """The arrays of one of the seeds trained side by side.
 
     Raises ConfigError if they do not do what the policy does, because a part of its networks is of another make.
@@ -51,7 +51,7 @@ def arrays_of(found: Trained, config: ResolvedConfig, index: int) -> Arrays:
         **layers,
         "action_low": np.asarray(low, np.float32),
         "action_high": np.asarray(high, np.float32),
-        "env": np.array(referee(config)),
+        "env": np.array(eval_env_id(config)),
         "episode_length": np.array(time_limit(config)),
     }
     _compare(arrays, Policy(policy, critic, config), found)
@@ -96,7 +96,7 @@ def _in_order(layers: Arrays) -> Arrays:
     }
 
 
-def _compare(arrays: Arrays, policy: Policy, found: Trained) -> None:
+def _compare(arrays: Arrays, policy: Policy, found: Networks) -> None:
     ours = outside.Policy(io.BytesIO(packed(arrays)))
     spread = np.random.default_rng(0).normal(size=(100, policy.observation_size))
     obs = arrays["observation_mean"] + 3 * spread * arrays["observation_std"]
@@ -112,7 +112,7 @@ def _compare(arrays: Arrays, policy: Policy, found: Trained) -> None:
             raise _foreign(found, f"as plain layers their {name} differ")
 
 
-def _foreign(found: Trained, why: str) -> ConfigError:
+def _foreign(found: Networks, why: str) -> ConfigError:
     return ConfigError(
         f"{found.path}: must have networks of dgae_jax's own make to be exported; {why}"
     )

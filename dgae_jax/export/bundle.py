@@ -12,7 +12,7 @@ from dgae_jax.export.arrays import Arrays, arrays_of, packed
 from dgae_jax.export.card import card
 from dgae_jax.export.facts import Facts, facts_of
 from dgae_jax.export.outside.policy import Policy
-from dgae_jax.run import files, restore
+from dgae_jax.run import checkpoint, files
 
 IMPORT = "from dgae_jax.export.outside.policy import Policy\n"
 """The line of the agent's source in whose place the class itself is put."""
@@ -73,7 +73,7 @@ def export(
     `source` is a run directory or a policy's file, `index` that among the seeds trained side by side. Raises as
     `restore.trained` and `arrays_of`, OSError where a file cannot be written.
     """
-    found = restore.trained(source, config, which)
+    found = checkpoint.load_networks(source, config, which)
     policy = Exported(
         arrays_of(found, config, index), config, facts_of(source, found.path, config, index)
     )

@@ -7,7 +7,7 @@ import numpy as np
 
 from dgae_jax.configs.resolved import ResolvedConfig
 from dgae_jax.export.facts import Facts
-from dgae_jax.run.engines import engines_of, referee
+from dgae_jax.run.options import engines_of, eval_env_id
 
 LICENCE = "Apache-2.0"
 """Of dgae_jax, and so of the programs that are copied beside a policy."""
@@ -65,7 +65,7 @@ def card(
         "actions": arrays["action_low"].size,
         "quantiles": _quantiles(arrays),
     }
-    task, engine = referee(config), engines_of(config)[0]
+    task, engine = eval_env_id(config), engines_of(config)[0]
     chosen = ", episodes which chose this checkpoint" if which == "best" else ""
     rows = {
         "task": f"{task}, episodes of at most {int(arrays['episode_length']):,} steps, observations [{sizes['observations']}], "

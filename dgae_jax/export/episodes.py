@@ -14,11 +14,11 @@ from jaxtyping import Float
 from dgae_jax.configs.resolved import ResolvedConfig
 from dgae_jax.maths.risk import weights_of
 from dgae_jax.maths.transport import directional_metric
-from dgae_jax.run import restore
+from dgae_jax.run import checkpoint
 from dgae_jax.run.api import Policy
-from dgae_jax.run.engines import referee
+from dgae_jax.run.calibration import MAX_RETURN_STEPS, steps_that_count
 from dgae_jax.run.evaluation import episode_seeds
-from dgae_jax.run.outcomes import LONGEST, steps_that_count
+from dgae_jax.run.options import eval_env_id
 
 
 class Actor(NamedTuple):
@@ -69,7 +69,7 @@ def of_runs(
     `index` is that among the seeds trained side by side. Raises as `restore.trained`.
     """
     cast = [
-        _actor(title, restore.trained(path, config, which), config, index)
+        _actor(title, checkpoint.load_networks(path, config, which), config, index)
         for title, path, config in runs
     ]
     yield from _played(cast, shots)
@@ -79,18 +79,18 @@ def of_checkpoints(
     path: Path, config: ResolvedConfig, index: int, shots: Shots
 ) -> Iterator[list[Episode]]:
     """The policy at each checkpoint that the run keeps, one after the other, oldest first. Raises as `restore.kept`."""
-    for found in restore.kept(path, config):
+    for found in checkpoint.load_all_networks(path, config):
         samples = int(found.path.stem.removeprefix("steps_"))
         yield from _played([_actor(f"after {samples:,} samples", found, config, index)], shots)
 
 
-def _actor(title: str, found: restore.Trained, config: ResolvedConfig, index: int) -> Actor:
+def _actor(title: str, found: checkpoint.Networks, config: ResolvedConfig, index: int) -> Actor:
     policy, critic = jax.tree.map(lambda x: x[index], (found.policy, found.critic))
     return Actor(
         title,
         Policy(policy, critic, config),
         config,
-        float(restore.reward_std(found.path, config)[index]),
+        float(checkpoint.reward_std(found.path, config)[index]),
     )
 
 
@@ -141,7 +141,9 @@ def _world(config: ResolvedConfig) -> Any:
 
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # that v4 is not the latest version is known
-        return gymnasium.make(referee(config), max_episode_steps=config.episode_length + LONGEST)
+        return gymnasium.make(
+            eval_env_id(config), max_episode_steps=config.episode_length + MAX_RETURN_STEPS
+        )
 
 
 def _steps(

@@ -5,9 +5,9 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from dgae_jax.configs.resolved import ResolvedConfig
-from dgae_jax.run import files, manifest
-from dgae_jax.run.evaluations import EvaluationsFile
-from dgae_jax.run.summary import counted
+from dgae_jax.run import directory, files
+from dgae_jax.run.metrics import EvaluationsFile
+from dgae_jax.run.terminal import counted
 
 
 class Facts(NamedTuple):
@@ -32,7 +32,7 @@ def facts_of(source: Path, found: Path, config: ResolvedConfig, index: int) -> F
     samples = int(found.stem.removeprefix("steps_"))
     evaluated = EvaluationsFile(source / "evaluations.jsonl").rows
     here = [row for row in evaluated if (row["steps"], row["seed"]) == (samples, seed)]
-    return _facts(found, samples, here[-1] if here else None, manifest.last(source))
+    return _facts(found, samples, here[-1] if here else None, directory.last_part(source))
 
 
 def _facts(found: Path, samples: Any, evaluation: Any, made: dict[str, Any]) -> Facts:

@@ -12,7 +12,7 @@ from jaxtyping import UInt8
 from dgae_jax.export.episodes import Episode
 from dgae_jax.export.stage import Stage
 from dgae_jax.export.strip import Strip
-from dgae_jax.run.compiling import Watch, unwatched
+from dgae_jax.run.runtime import Watch, unwatched
 
 HOLD = 0.6
 """Seconds for which the last frame of an episode stands."""

@@ -9,7 +9,7 @@ from dgae_jax.report.deviations import deviations
 from dgae_jax.report.groups import Group, by_task, groups_of
 from dgae_jax.report.published import Published
 from dgae_jax.report.results import Study
-from dgae_jax.run.summary import counted
+from dgae_jax.run.terminal import counted
 
 
 class Content(NamedTuple):

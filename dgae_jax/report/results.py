@@ -15,7 +15,7 @@ import numpy as np
 from dgae_jax.configs.algorithms import ALGORITHMS
 from dgae_jax.configs.config import ConfigError
 from dgae_jax.run import files, terminal
-from dgae_jax.run.summary import mean_of_worst
+from dgae_jax.run.evaluation import cvar
 
 RESULTS = "results.jsonl"
 
@@ -215,7 +215,7 @@ def _row(data: dict[str, Any], where: str) -> Row:
         **{name: found[name] for name in same},
         engine=found["final.engine"],
         final=float(found["final.return_mean"]),
-        worst=mean_of_worst(np.array(found["final.returns"]), 0.25),
+        worst=cvar(np.array(found["final.returns"]), 0.25),
         best=best.get("best.return_mean"),
         best_steps=best.get("best.steps"),
         curve_steps=steps,

@@ -1,1 +1,1 @@
-"""One run on disk: the loop, checkpoints, metrics, evaluations, progress and signals."""
+"""One run on disk: training loop, checkpoints, metrics, evaluation, fault tolerance."""

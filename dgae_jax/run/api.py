@@ -17,7 +17,7 @@ from dgae_jax.envs.base import Env
 from dgae_jax.envs.registry import given
 from dgae_jax.learn.build import make_greedy, make_quantiles, make_task
 from dgae_jax.learn.types import InferenceState
-from dgae_jax.run import directory, loop, metrics, restore, terminal
+from dgae_jax.run import checkpoint, directory, metrics, terminal, training
 from dgae_jax.run.options import RunOptions
 from dgae_jax.run.training import RunError
 
@@ -96,9 +96,7 @@ def train(
     with terminal.silenced(quiet), given(env) as name, _directory(run_dir) as path:
         config = config if name is None else dataclasses.replace(config, env=name)
         chosen = RunOptions(run_dir=path, **options)
-        evaluation = (loop.go_on_or_start if chosen.resume_or_start else loop.start)(
-            config, chosen
-        ).evaluation
+        evaluation = training.train(resolve(config), chosen).evaluation
         return Run(
             load_policy(path, env=env),
             metrics.read(path / "metrics.jsonl"),
@@ -128,7 +126,7 @@ def _load(run_dir: Path, config: ResolvedConfig, which: str, seed: int) -> Polic
         raise ConfigError(
             f"seed {seed}: must be a whole number from 0 to {config.num_seeds - 1}, the index of a trained seed"
         )
-    found = restore.trained(run_dir, config, which)
+    found = checkpoint.load_networks(run_dir, config, which)
     policy, critic = jax.tree.map(lambda x: x[seed], (found.policy, found.critic))
     return Policy(policy, critic, config)
 

@@ -7,20 +7,25 @@ arrays should be, a tree of shapes, and whether the configuration fits is for th
 import hashlib
 import json
 import re
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
-from typing import Any, BinaryIO, TypeVar
+from typing import Any, BinaryIO, NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
 import msgpack
 import numpy as np
+from jaxtyping import ArrayLike
 
-from dgae_jax.configs.config import ConfigError
+from dgae_jax.configs.config import ConfigError, invalid
 from dgae_jax.configs.resolved import ResolvedConfig, resolve
-from dgae_jax.configs.serial import from_dict, to_dict
-from dgae_jax.run import files, hosts
+from dgae_jax.configs.serial import MAY_CHANGE, differences, from_dict, to_dict
+from dgae_jax.learn.build import make_task, make_trainer, seed_keys
+from dgae_jax.learn.types import InferenceState, TrainState
+from dgae_jax.run import files, runtime, terminal
+from dgae_jax.run.metrics import EvaluationsFile
 
 T = TypeVar("T")
 
@@ -53,7 +58,7 @@ class NotFiniteError(CheckpointError):
 
 def arrays_of(tree: Any) -> dict[str, np.ndarray]:
     """A copy of the tree's arrays by name, as `save` takes them."""
-    return {name: np.array(hosts.whole(x)) for name, x in sorted(_plain(tree).items())}
+    return {name: np.array(runtime.gather(x)) for name, x in sorted(_plain(tree).items())}
 
 
 def save(
@@ -71,10 +76,10 @@ def save(
     """
     for name in not_finite(arrays):
         raise NotFiniteError(f"{name} is not finite after {steps:,} samples")
-    path = directory / name_of(steps)
+    path = directory / file_name(steps)
     write(path, config, arrays)
-    for old in [p for p in found(directory) if p.name <= path.name][:-keep]:
-        if best is None or old.name != name_of(best):
+    for old in [p for p in checkpoints_in(directory) if p.name <= path.name][:-keep]:
+        if best is None or old.name != file_name(best):
             old.unlink(missing_ok=True)
     return path
 
@@ -93,12 +98,12 @@ def _packed(x: np.ndarray) -> msgpack.ExtType:
     return msgpack.ExtType(ARRAY, msgpack.packb((x.shape, x.dtype.name, x.tobytes())))  # pyright: ignore[reportArgumentType]
 
 
-def name_of(steps: int) -> str:
+def file_name(steps: int) -> str:
     """The file of the state after so many samples."""
     return f"steps_{steps:012d}.msgpack"
 
 
-def found(directory: Path) -> list[Path]:
+def checkpoints_in(directory: Path) -> list[Path]:
     """The checkpoints in a directory, oldest first; no link is followed."""
     named = (
         p
@@ -284,3 +289,157 @@ def _plain(tree: Any) -> dict[str, Any]:
 
 def _name(path) -> str:
     return jax.tree_util.keystr(path, simple=True, separator=".")
+
+
+T = TypeVar("T")
+
+WHICH = ("latest", "best")
+"""Which checkpoint: the latest whole one, or that of the best evaluation."""
+
+
+class Networks(NamedTuple):
+    """Policy and critic of every run in a checkpoint, with a leading axis of runs, and its file."""
+
+    policy: InferenceState
+    critic: InferenceState
+    path: Path
+
+
+def latest_train_state(run_dir: Path, config: ResolvedConfig) -> tuple[TrainState, Path]:
+    """All of the latest checkpoint that is whole, and its file; warns of damaged ones.
+
+    Raises CheckpointError if there is none, or it is of another run than `config`.
+    """
+    return _latest(run_dir, partial(load_train_state, config=config))
+
+
+def load_networks(source: Path, config: ResolvedConfig, which: str) -> Networks:
+    """The networks of a run directory's latest checkpoint or its best, or of a file; nothing else in the file is looked at.
+
+    Raises ConfigError if the best is asked for and nothing was evaluated, CheckpointError as `training_state`.
+    """
+    if which not in WHICH:
+        raise invalid("checkpoint", which, f"one of {', '.join(WHICH)}")
+    if source.is_file():
+        if which != "latest":
+            raise invalid("checkpoint", which, f"latest: {source} is a single one")
+        return _load_networks(source, config)
+    run_dir = source
+    if which == "latest":
+        return _latest(run_dir, partial(_load_networks, config=config))[0]
+    steps = EvaluationsFile(run_dir / "evaluations.jsonl").best
+    if steps is None:
+        raise invalid("checkpoint", which, f"latest: {run_dir} has no evaluations")
+    return _load_networks(run_dir / "checkpoints" / file_name(steps), config)
+
+
+def load_all_networks(run_dir: Path, config: ResolvedConfig) -> Iterator[Networks]:
+    """The networks of every checkpoint that a run keeps, oldest first; warns of damaged ones and leaves them out.
+
+    Raises CheckpointError if there is none, or one is of another run than `config`.
+    """
+    paths = checkpoints_in(run_dir / "checkpoints")
+    if not paths:
+        raise _none(run_dir)
+    for path in paths:
+        try:
+            yield _load_networks(path, config)
+        except DamagedError as reason:
+            terminal.warn(f"warning: {reason}; left out")
+
+
+def reward_std(path: Path, config: ResolvedConfig) -> np.ndarray:
+    """What the rewards of every run [S] were last divided by in the checkpoint at `path`; 1 without `normalize_rewards`.
+
+    Raises CheckpointError for a file that does not say, as those of policies once did not.
+    """
+    if not config.normalize_rewards:
+        return np.ones(config.num_seeds)
+    part = _scale(_blank(config).reward_scale.returns.std)
+    try:
+        return np.asarray(load(path, part, part=True)["reward_scale"]["returns"]["std"])
+    except MissingError:
+        raise CheckpointError(
+            f"{path}: does not say what rewards were divided by; dgae refit fits a critic that does"
+        ) from None
+
+
+def load_train_state(path: Path, config: ResolvedConfig) -> TrainState:
+    """The training state in one file; raises as `checkpoint.load`, and CheckpointError if the file is not of this run."""
+    _compare(path, config)
+    state = load(path, _blank(config))
+    for iteration in state.iteration:
+        if path.name != file_name(int(iteration) * config.samples_per_iteration):
+            raise CheckpointError(f"{path}: is renamed, it was saved after {iteration} iterations")
+    return state
+
+
+def reset_episodes(state: TrainState, config: ResolvedConfig) -> TrainState:
+    """The training state with every world at the beginning of an episode, as it is after no other number of iterations."""
+    keys = jax.vmap(jax.random.fold_in)(seed_keys(config), state.iteration)
+    new = make_trainer(make_task(config), 1).init(config, keys).episodes
+    episodes = state.episodes._replace(env=new.env, steps=new.steps, total=new.total)
+    scale = state.reward_scale._replace(discounted=jnp.zeros_like(state.reward_scale.discounted))
+    return state._replace(episodes=episodes, reward_scale=scale)
+
+
+def save_networks(path: Path, config: ResolvedConfig, networks: Networks, std: ArrayLike) -> None:
+    """What acting and predicting takes as a file of its own, which `trained` and `reward_std` read; `std` as from the latter."""
+    (policy, critic), stats = (networks.policy, networks.critic), networks.policy.obs_stats
+    scale = _scale(jnp.asarray(std, jnp.float32)) if config.normalize_rewards else {}
+    write(path, config, arrays_of(_networks(policy.params, critic.params, stats) | scale))
+
+
+def _networks(policy: Any, critic: Any, obs_stats: Any) -> dict[str, Any]:
+    """As they are named in a training state."""
+    return {
+        "policy": {"params": policy},
+        "critic": {"params": critic},
+        "obs_stats": obs_stats,
+    }
+
+
+def _scale(std: Any) -> dict[str, Any]:
+    """As it is named in a training state."""
+    return {"reward_scale": {"returns": {"std": std}}}
+
+
+def _load_networks(path: Path, config: ResolvedConfig) -> Networks:
+    _compare(path, config)
+    blank: Any = _blank(config)
+    part = _networks(blank.policy.params, blank.critic.params, blank.obs_stats)
+    got = load(path, part, part=True)
+    policy, critic = (
+        InferenceState(got[name]["params"], got["obs_stats"]) for name in ("policy", "critic")
+    )
+    return Networks(policy, critic, path)
+
+
+def _compare(path: Path, config: ResolvedConfig) -> None:
+    """Arrays of the same shapes may be of another run."""
+    for name, (ours, theirs) in differences(config, config_of(path)).items():
+        if name not in MAY_CHANGE:
+            raise CheckpointError(f"{path}: is of another run, its {name} is {theirs}, here {ours}")
+
+
+def _blank(config: ResolvedConfig) -> TrainState:
+    """Shapes and dtypes of a state."""
+    return jax.eval_shape(make_trainer(make_task(config), 1).init, config, seed_keys(config))
+
+
+def _latest(run_dir: Path, read: Callable[[Path], T]) -> tuple[T, Path]:
+    wrong = []
+    for path in reversed(checkpoints_in(run_dir / "checkpoints")):
+        try:
+            result = read(path)
+        except DamagedError as reason:
+            wrong.append(str(reason))
+            continue
+        for each in wrong:
+            terminal.warn(f"warning: {each}; linear_schedule back to {path.name}")
+        return result, path
+    raise CheckpointError("; ".join(wrong)) if wrong else _none(run_dir)
+
+
+def _none(run_dir: Path) -> CheckpointError:
+    return CheckpointError(f"{run_dir}: must hold a checkpoint; checkpoints/ has none")

@@ -7,21 +7,27 @@ import contextlib
 import errno
 import fcntl
 import glob
+import importlib.metadata
 import json
 import os
+import platform
 import shutil
 import stat
+import subprocess
+import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator
+from functools import cache
 from pathlib import Path
-from typing import IO
+from typing import IO, Any
 
 from dgae_jax.configs.config import ConfigError, invalid
 from dgae_jax.configs.resolved import ResolvedConfig, resolve
 from dgae_jax.configs.serial import from_dict, to_dict
-from dgae_jax.run import files, manifest, terminal
-from dgae_jax.run.options import RunOptions
+from dgae_jax.run import files, terminal
+from dgae_jax.run.options import RunOptions, read_options
+from dgae_jax.run.options import saved_options as options_to_save
 
 
 class InUseError(ConfigError):
@@ -98,7 +104,7 @@ def _is_empty(path: Path) -> bool:
 
 def _fill(path: Path, config: ResolvedConfig, options: RunOptions) -> None:
     (path / "checkpoints").mkdir(exist_ok=True)
-    manifest.write(path, options)
+    write_manifest(path, options)
     write_config(path, config)
 
 
@@ -233,3 +239,126 @@ def read_config_file(path: Path) -> ResolvedConfig:
 def write_config(path: Path, config: ResolvedConfig) -> None:
     """`config.json` of the run directory `path`."""
     files.write_json(path / "config.json", to_dict(config))
+
+
+_VERSIONS_OF = (
+    "dgae_jax",
+    "jax",
+    "jaxlib",
+    "flax",
+    "optax",
+    "brax",
+    "mujoco",
+    "mujoco-mjx",
+    "playground",
+    "gymnasium",
+    "numpy",
+)
+
+
+def write_manifest(run_dir: Path, options: RunOptions) -> None:
+    """The first part of a run."""
+    files.write_json(run_dir / "manifest.json", {**_part(options), "resumed": []})
+
+
+def extend_manifest(run_dir: Path, options: RunOptions) -> None:
+    """A part that continues it."""
+    before = _read_manifest(run_dir)
+    parts = [*_resumed(before), _part(options)]
+    files.write_json(run_dir / "manifest.json", {**before, "resumed": parts})
+
+
+def saved_options(run_dir: Path) -> RunOptions:
+    """The options of the last part of the run, as far as they can be read."""
+    return read_options(last_part(run_dir).get("options"))
+
+
+def environment_changes(run_dir: Path, options: RunOptions) -> list[str]:
+    """What decides the bits of a result and is not what it was in the last part of the run."""
+    was, now = _deciding(last_part(run_dir)), _deciding(_part(options))
+    return [
+        f"{name} {value} (was {was.get(name)})"
+        for name, value in now.items()
+        if was.get(name) != value
+    ]
+
+
+def _deciding(part: dict[str, Any]) -> dict[str, Any]:
+    found = {name: part.get(name) for name in ("device", "cores", "processes", "git_revision")}
+    for table in (part.get("settings"), part.get("versions")):
+        found |= table if isinstance(table, dict) else {}
+    options = part.get("options")
+    return found | {"devices": options.get("devices") if isinstance(options, dict) else None}
+
+
+def last_part(run_dir: Path) -> dict[str, Any]:
+    """By what the last part of the run was computed; empty if it cannot be read."""
+    before = _read_manifest(run_dir)
+    part = (_resumed(before) or [before])[-1]
+    return part if isinstance(part, dict) else {}
+
+
+def _read_manifest(run_dir: Path) -> dict[str, Any]:
+    """The manifest; empty if there is none that can be understood."""
+    try:
+        found = json.loads((run_dir / "manifest.json").read_text())
+    except (OSError, ValueError, RecursionError):
+        return {}
+    return found if isinstance(found, dict) else {}
+
+
+def _resumed(manifest: dict[str, Any]) -> list[Any]:
+    found = manifest.get("resumed")
+    return found if isinstance(found, list) else []
+
+
+def _part(options: RunOptions) -> dict[str, Any]:
+    from dgae_jax.run import runtime
+
+    return {
+        "started": time.strftime("%Y-%m-%dT%H:%M:%S%z"),
+        "command": sys.argv,
+        "git_revision": _git_revision(),
+        "python": platform.python_version(),
+        "platform": platform.platform(),
+        **runtime.hardware(),
+        "versions": {name: _version(name) for name in _VERSIONS_OF},
+        "options": options_to_save(options),
+    }
+
+
+@cache
+def _version(name: str) -> str | None:
+    try:
+        return importlib.metadata.version(name)
+    except importlib.metadata.PackageNotFoundError:
+        return None
+
+
+@cache
+def _git_revision() -> str | None:
+    """The commit of the source tree, `+` appended where files differ from it; None outside a checkout.
+
+    A busy machine takes its time to say so, and None of a checkout would keep a run from going on.
+    """
+
+    def git(*words: str) -> str:
+        done = subprocess.run(
+            ["git", *words],
+            cwd=Path(__file__).parent,
+            capture_output=True,
+            text=True,
+            check=True,
+            timeout=60,
+        )
+        return done.stdout.strip()
+
+    try:
+        git(
+            "ls-files", "--error-unmatch", Path(__file__).name
+        )  # a repository around an installed package is another one
+        return git("rev-parse", "HEAD") + (
+            "+" if git("status", "--porcelain", "--untracked-files=no") else ""
+        )
+    except (OSError, subprocess.SubprocessError):
+        return None

@@ -17,10 +17,11 @@ from dgae_jax.learn import play
 from dgae_jax.learn.build import make_greedy, make_task, make_trainer
 from dgae_jax.learn.parallel import Trainer
 from dgae_jax.learn.types import InferenceState
-from dgae_jax.run import files, restore
-from dgae_jax.run.compiling import Watch, compile_aside, unwatched
-from dgae_jax.run.engines import engine_of, referee
-from dgae_jax.run.summary import counted, over_seeds, summary
+from dgae_jax.maths.statistics import bootstrap_interval, iqm
+from dgae_jax.run import checkpoint, files
+from dgae_jax.run.options import engine_of, eval_env_id
+from dgae_jax.run.runtime import Watch, compile_in_thread, unwatched
+from dgae_jax.run.terminal import counted
 
 CHUNK = 50
 """Steps between looks at signals and clock."""
@@ -39,18 +40,18 @@ def time_limit(config: ResolvedConfig) -> int:
     return min(config.episode_length, own or config.episode_length)
 
 
-def make_referee(config: ResolvedConfig) -> Any:
+def make_eval_env(config: ResolvedConfig) -> Any:
     """A world of the task in Gymnasium, with the time limit that episodes in training have."""
     import gymnasium  # here, so that training alone does not import it
 
     if spec_of(config.env).gymnasium_id is None:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # that v4 is not the latest version is known
-            return gymnasium.make(referee(config), max_episode_steps=config.episode_length)
+            return gymnasium.make(eval_env_id(config), max_episode_steps=config.episode_length)
     from dgae_jax.envs.gymnasium import make_world
 
     return gymnasium.wrappers.TimeLimit(
-        make_world(referee(config)), config.episode_length
+        make_world(eval_env_id(config)), config.episode_length
     )  # beside the task's own
 
 
@@ -80,7 +81,7 @@ def evaluate_run(
 ) -> dict[str, Any]:
     """`evaluate_policies` for a run's latest checkpoint or the best of its evaluations; raises as it and `restore.trained`."""
     engine = engine_of(config, engine)
-    found = restore.trained(run_dir, config, which)
+    found = checkpoint.load_networks(run_dir, config, which)
     result = evaluate_policies(
         found.policy, config, engine=engine, episodes=episodes, seed=seed, watch=watch
     )
@@ -103,7 +104,7 @@ def evaluate_policies(
     """
     engine = engine_of(config, engine)
     run = _in_gymnasium if engine == "gymnasium" else _in_jax
-    per_run, where = [], f"{referee(config)} ({engine})"
+    per_run, where = [], f"{eval_env_id(config)} ({engine})"
     for i in range(config.num_seeds):
         of = f", seed {config.seed + i}" if config.num_seeds > 1 else ""
         one = jax.tree.map(lambda x, i=i: x[i], policies)
@@ -115,10 +116,10 @@ def evaluate_policies(
         per_run.append(run(one, config, engine, episodes, seed, progress))
     return {
         "engine": engine,
-        "env": referee(config),
+        "env": eval_env_id(config),
         "episodes": episodes * config.num_seeds,
         **summary(np.concatenate(per_run)),
-        **(over_seeds(per_run) if len(per_run) > 1 else {}),
+        **(seed_statistics(per_run) if len(per_run) > 1 else {}),
         "seeds": [
             {"seed": config.seed + i, **summary(returns)} for i, returns in enumerate(per_run)
         ],
@@ -162,7 +163,7 @@ def _fresh_worlds(config: ResolvedConfig, seed: int, episodes: int, progress: _P
         np.random.SeedSequence((seed, i)).generate_state(config.num_seeds) for i in range(batches)
     ]
     keys = [jnp.stack([jax.random.key(int(n)) for n in each]) for each in numbers]
-    compile_aside(
+    compile_in_thread(
         init, config, keys[0], watch=progress.watch, what=f"{progress.what}: compiling resets"
     )
     worlds = [
@@ -188,7 +189,7 @@ def _in_jax(
         play.begin(_fresh_worlds(config, seed, episodes, progress)),
         _programs(config, GIVEN.get(config.env))[1],
     )
-    compile_aside(
+    compile_in_thread(
         go_on, policy, now, 1, watch=progress.watch, what=f"{progress.what}: compiling steps"
     )
     while (step := int(now.step)) < config.episode_length and (alive := int(now.alive.sum())):
@@ -211,11 +212,11 @@ def _in_gymnasium(
     progress: _Progress,
 ) -> np.ndarray:
     """Gymnasium's own task in C MuJoCo, the referee: episodes side by side, one batched policy call per step."""
-    worlds = [make_referee(config) for _ in range(episodes)]
+    worlds = [make_eval_env(config) for _ in range(episodes)]
     greedy = _greedy(config, GIVEN.get(config.env))
     starts = zip(episode_seeds(seed, episodes), worlds, strict=True)
     obs = np.stack([world.reset(seed=int(number))[0] for number, world in starts])
-    compile_aside(
+    compile_in_thread(
         greedy,
         policy,
         obs.astype(np.float32),
@@ -235,3 +236,52 @@ def _in_gymnasium(
     for world in worlds:
         world.close()
     return total
+
+
+@np.errstate(invalid="ignore")  # a return that is not finite makes numbers that are not either
+def summary(returns: np.ndarray) -> dict[str, Any]:
+    """Mean, standard deviation, tails and quantiles of returns [E], and each of them."""
+    return {
+        "return_mean": float(returns.mean()),
+        "return_std": float(returns.std()),
+        "return_cvar": {str(share): cvar(returns, share) for share in (0.05, 0.1, 0.25)},
+        "return_quantiles": {
+            str(q): float(np.quantile(returns, q)) for q in (0.05, 0.25, 0.5, 0.75, 0.95)
+        },
+        "returns": [round(float(r), 4) for r in returns],
+    }
+
+
+def cvar(returns: np.ndarray, share: float) -> float:
+    """CVaR: the mean of the lowest `share` of returns [E], of one at least."""
+    return float(np.sort(returns)[: max(1, round(share * len(returns)))].mean())
+
+
+def seed_statistics(returns: list[np.ndarray]) -> dict[str, Any]:
+    """What separates trained seeds: the mean of their mean returns, its spread, and how sure it is.
+
+    `seeds_std` is the sample standard deviation (n − 1) of the seeds' means; `interval` and `iqm_interval` are 95 % percentile
+    bootstrap intervals over seeds, of the mean and of the interquartile mean. With few seeds they are too narrow.
+    """
+    means = np.array([each.mean() for each in returns])
+    key, ours = jax.random.key(0), jnp.asarray(means, jnp.float32)
+    return {
+        "seeds_mean": float(means.mean()),
+        "seeds_std": float(means.std(ddof=1)),
+        "interval": [float(x) for x in bootstrap_interval(key, ours, jnp.mean)],
+        "iqm": float(iqm(ours)),
+        "iqm_interval": [float(x) for x in bootstrap_interval(key, ours)],
+    }
+
+
+def describe(result: dict[str, Any]) -> str:
+    """An evaluation in one line."""
+    seeds, where = (
+        len(result["seeds"]),
+        f"of the deterministic policy in {result['env']} ({result['engine']})",
+    )
+    if seeds == 1:
+        return f"return {result['return_mean']:,.1f} ± {result['return_std']:,.1f} over {counted(result['episodes'], 'episode')} {where}"
+    low, high = result["interval"]
+    spread = f"standard deviation {result['seeds_std']:,.1f} over seeds, 95 % interval of the mean {low:,.1f} to {high:,.1f}"
+    return f"return {result['seeds_mean']:,.1f}, mean of {seeds} seeds × {counted(result['episodes'] // seeds, 'episode')} {where}; {spread}"

@@ -8,9 +8,9 @@ from typing import Any
 
 from dgae_jax.configs.config import ConfigError, invalid
 from dgae_jax.configs.resolved import ResolvedConfig
-from dgae_jax.run.engines import engine_of
+from dgae_jax.envs.registry import spec_of
 
-SINKS = {"tensorboard": "tensorboardX", "wandb": "wandb", "mlflow": "mlflow"}
+METRIC_LOGGERS = {"tensorboard": "tensorboardX", "wandb": "wandb", "mlflow": "mlflow"}
 """Viewers of metrics that a run can feed, and the library that each takes."""
 
 
@@ -58,7 +58,7 @@ class RunOptions:
         object.__setattr__(self, "log", tuple(self.log))  # a list, from Python or JSON
 
 
-WHOLE = {
+INTEGER_RANGES = {
     "devices": (1, 100_000, "in one machine"),
     "num_processes": (1, 100_000, "in one run"),
     "process_id": (0, 99_999, "processes are counted from 0"),
@@ -73,7 +73,7 @@ WHOLE = {
 def validate_options(options: RunOptions, config: ResolvedConfig) -> None:
     """Raise `ConfigError` for the first option that is invalid, in a run of `config`."""
     engine_of(config, options.eval_engine, "eval_engine")
-    for name, (low, high, reason) in WHOLE.items():
+    for name, (low, high, reason) in INTEGER_RANGES.items():
         value = getattr(options, name)
         if value is not None and not (type(value) is int and low <= value <= high):
             raise invalid(name, value, f"a whole number from {low:,} to {high:,} ({reason})")
@@ -103,16 +103,17 @@ def validate_options(options: RunOptions, config: ResolvedConfig) -> None:
 
 def _validate_log(names: tuple[str, ...]) -> None:
     for name in names:
-        if name not in SINKS:
-            raise invalid("log", name, f"one or more of {', '.join(SINKS)}")
+        if name not in METRIC_LOGGERS:
+            raise invalid("log", name, f"one or more of {', '.join(METRIC_LOGGERS)}")
         if names.count(name) > 1:
             raise invalid("log", names, "each viewer once")
-        spec = importlib.util.find_spec(SINKS[name])
+        spec = importlib.util.find_spec(METRIC_LOGGERS[name])
         if (
             spec is None or spec.origin is None
         ):  # a folder of that name in the working directory, such as Weights & Biases leaves
             raise ConfigError(
-                f'log {name}: {SINKS[name]} is missing; pip install "dgae_jax[{name}]"', "log"
+                f'log {name}: {METRIC_LOGGERS[name]} is missing; pip install "dgae_jax[{name}]"',
+                "log",
             )
 
 
@@ -129,17 +130,40 @@ _KEPT = (
 """What a run goes on with when it is resumed."""
 
 
-def to_dict(options: RunOptions) -> dict[str, Any]:
+def saved_options(options: RunOptions) -> dict[str, Any]:
     """What a run goes on with, for JSON."""
     return {name: getattr(options, name) for name in _KEPT} | {"log": list(options.log)}
 
 
-def from_dict(data: Any) -> RunOptions:
-    """What `to_dict` wrote; defaults for all else."""
+def read_options(data: Any) -> RunOptions:
+    """What `saved_options` wrote; defaults for all else."""
     found = data if isinstance(data, dict) else {}
-    usual = to_dict(RunOptions(devices=1, eval_engine=""))
+    usual = saved_options(RunOptions(devices=1, eval_engine=""))
     kept: dict[str, Any] = {
         name: found[name] for name in _KEPT if type(found.get(name)) is type(usual[name])
     }
-    viewers: dict[str, Any] = {"log": [name for name in SINKS if name in kept.get("log", [])]}
+    viewers: dict[str, Any] = {
+        "log": [name for name in METRIC_LOGGERS if name in kept.get("log", [])]
+    }
     return RunOptions(**kept | viewers)
+
+
+def engines_of(config: ResolvedConfig) -> tuple[str, ...]:
+    """Where a run can be evaluated, the referee first: Gymnasium for our tasks and its own, the run's own physics for any other."""
+    spec = spec_of(config.env)
+    return ("gymnasium", *spec.engines) if spec.referees else spec.engines
+
+
+def engine_of(config: ResolvedConfig, engine: str | None, setting: str = "engine") -> str:
+    """The engine of that name, the first of `engines_of` where there is none; raises ConfigError if the run cannot have it.
+
+    `setting` is what the name was given as.
+    """
+    if engine is not None and engine not in engines_of(config):
+        raise invalid(setting, engine, f"one of {', '.join(engines_of(config))} with {config.env}")
+    return engine or engines_of(config)[0]
+
+
+def eval_env_id(config: ResolvedConfig) -> str:
+    """Gymnasium's name of the task, or ours where Gymnasium does not play it."""
+    return spec_of(config.env).referee(config.env_version) or config.env

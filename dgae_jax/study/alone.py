@@ -7,7 +7,7 @@ import optuna
 from optuna.trial import Trial
 
 from dgae_jax.configs.config import ConfigError
-from dgae_jax.run import loop, machine
+from dgae_jax.run import runtime, training
 from dgae_jax.run.training import DivergedError
 from dgae_jax.study.storage import first_number
 from dgae_jax.study.tuning import Tuning, quarter, value_of
@@ -16,8 +16,8 @@ from dgae_jax.study.tuning import Tuning, quarter, value_of
 def ready(tuning: Tuning) -> None:
     """Look at the machine before trials are taken; raises ConfigError where none could be trained on it."""
     config = dataclasses.replace(tuning.config, num_seeds=tuning.seeds)
-    machine.use_devices(config, dataclasses.replace(tuning.options, num_processes=1))
-    machine.use_cache(tuning.options.cache_dir)
+    runtime.use_devices(config, dataclasses.replace(tuning.options, num_processes=1))
+    runtime.use_cache(tuning.options.cache_dir)
 
 
 def train(tuning: Tuning, study: optuna.Study, trial: Trial) -> float:
@@ -34,7 +34,7 @@ def train(tuning: Tuning, study: optuna.Study, trial: Trial) -> float:
         options = dataclasses.replace(
             tuning.options, run_dir=here, resume_or_start=True, inexact=True, **kept
         )
-        loop.prepared(
+        training.prepare(
             config, options
         )  # `ready` has seen that it is not the machine that is at fault
     except ConfigError as reason:
@@ -46,7 +46,7 @@ def train(tuning: Tuning, study: optuna.Study, trial: Trial) -> float:
             raise optuna.TrialPruned(f"worse than most were after {steps:,} steps")
 
     try:
-        value = value_of(loop.go_on_or_start(config, options, heed).evaluation)
+        value = value_of(training.train(config, options, heed).evaluation)
     except DivergedError as reason:
         raise optuna.TrialPruned(str(reason)) from reason
     if not math.isfinite(value):

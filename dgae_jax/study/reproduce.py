@@ -10,7 +10,7 @@ import numpy as np
 
 from dgae_jax.run import terminal
 from dgae_jax.run.options import RunOptions
-from dgae_jax.run.signals import Signals
+from dgae_jax.run.runtime import Signals
 from dgae_jax.study import results
 from dgae_jax.study.launch import Launch, Task
 from dgae_jax.study.matrix import Cell, Study

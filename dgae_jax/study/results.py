@@ -11,7 +11,7 @@ import numpy as np
 
 from dgae_jax.configs.resolved import ResolvedConfig
 from dgae_jax.configs.serial import to_dict
-from dgae_jax.run import evaluations, files, metrics
+from dgae_jax.run import files, metrics
 from dgae_jax.study.matrix import Cell, Study
 
 POINTS = 200
@@ -46,7 +46,7 @@ def rows_of(study: Study, cell: Cell) -> list[dict[str, Any]]:
     )
     trained, evaluated = (
         metrics.read(run_dir / "metrics.jsonl"),
-        evaluations.EvaluationsFile(run_dir / "evaluations.jsonl").rows,
+        metrics.EvaluationsFile(run_dir / "evaluations.jsonl").rows,
     )
     head = {
         "cell": cell.name,
@@ -128,7 +128,7 @@ def _curve(rows: list[dict[str, Any]]) -> dict[str, list]:
 def _keep_policy(run_dir: Path, config: ResolvedConfig, path: Path) -> None:
     """Write it unless it is there already, from this run: a cell that is trained again has a new one."""
     if not path.is_file() or path.stat().st_mtime < (run_dir / "evaluation.json").stat().st_mtime:
-        from dgae_jax.run import restore
+        from dgae_jax.run import checkpoint
 
-        found = restore.trained(run_dir, config, "latest")
-        restore.save_networks(path, config, found, restore.reward_std(found.path, config))
+        found = checkpoint.load_networks(run_dir, config, "latest")
+        checkpoint.save_networks(path, config, found, checkpoint.reward_std(found.path, config))

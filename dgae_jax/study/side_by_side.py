@@ -25,11 +25,10 @@ from dgae_jax.learn.build import (
 from dgae_jax.learn.memory import check_memory
 from dgae_jax.learn.parallel import COMPILER_OPTIONS, over_seeds
 from dgae_jax.learn.types import TrainState
-from dgae_jax.run import files, machine
-from dgae_jax.run.compiling import compile_aside
+from dgae_jax.run import files, runtime
 from dgae_jax.run.evaluation import evaluate_policies
 from dgae_jax.run.options import RunOptions
-from dgae_jax.run.signals import Signals, Stopped
+from dgae_jax.run.runtime import Signals, Stopped, compile_in_thread
 from dgae_jax.study.storage import first_number
 from dgae_jax.study.tuning import Tuning, quarter, value_of
 
@@ -55,21 +54,21 @@ def train(
 ) -> list[float | None]:
     """The value of each trial, None where it was pruned or broke down. Raises Stopped when a signal came: then all is lost."""
     configs = [tuning.config_of(trial.params) for trial in trials]
-    machine.use_devices(configs[0], RunOptions(devices=1, num_processes=1))
-    machine.use_cache(tuning.options.cache_dir)
+    runtime.use_devices(configs[0], RunOptions(devices=1, num_processes=1))
+    runtime.use_cache(tuning.options.cache_dir)
     env, keys, settings = make_task(configs[0]), seed_keys(configs[0]), stacked(configs)
     check_memory(
         dataclasses.replace(configs[0], num_seeds=len(configs) * tuning.seeds),
         env,
-        machine.memory(),
+        runtime.available_memory(),
     )
     init, step = make_trainer(env, 1).init, make_step(env)
     with signals.may_stop() as watch:
-        compile_aside(init, configs[0], keys, watch=watch)
+        compile_in_thread(init, configs[0], keys, watch=watch)
         states = stacked(
             [init(config, keys) for config in configs]
         )  # one after the other: see parallel.in_turn
-        compile_aside(step, settings, states, watch=watch)
+        compile_in_thread(step, settings, states, watch=watch)
     options = (
         tuning.options
     )  # no trial's network differs in shape, so that one program evaluates them all

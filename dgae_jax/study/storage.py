@@ -21,7 +21,7 @@ from optuna.trial import FrozenTrial, Trial, TrialState
 
 from dgae_jax.configs.config import invalid
 from dgae_jax.configs.serial import differences, from_dict, to_dict
-from dgae_jax.run.engines import engine_of
+from dgae_jax.run.options import engine_of
 from dgae_jax.study.search import Choice, Range, values_of
 from dgae_jax.study.tuning import Tuning
 

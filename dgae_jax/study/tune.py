@@ -30,7 +30,7 @@ def tune(tuning: Tuning) -> int:
         raise invalid(
             "study", tuning.directory, f"a directory that can be written ({reason.strerror})"
         ) from reason
-    from dgae_jax.run.signals import Signals
+    from dgae_jax.run.runtime import Signals
     from dgae_jax.study import outcome
     from dgae_jax.study.storage import open_storage, open_study
     from dgae_jax.study.trials import finished, is_over

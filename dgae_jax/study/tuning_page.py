@@ -12,8 +12,8 @@ from matplotlib.ticker import MaxNLocator
 from optuna.trial import FrozenTrial
 
 from dgae_jax.run import files
-from dgae_jax.run.engines import engine_of
-from dgae_jax.run.summary import counted
+from dgae_jax.run.options import engine_of
+from dgae_jax.run.terminal import counted
 from dgae_jax.study.search import Range
 from dgae_jax.study.storage import unwarned
 from dgae_jax.study.trials import finished

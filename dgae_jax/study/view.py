@@ -14,7 +14,7 @@ from rich.live import Live
 from rich.table import Table
 
 from dgae_jax.run import terminal
-from dgae_jax.run.progress import clock
+from dgae_jax.run.terminal import clock
 from dgae_jax.study.matrix import Cell, Study
 
 PLAIN_EVERY = 30.0

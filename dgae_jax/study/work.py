@@ -20,7 +20,7 @@ from dgae_jax.configs.config import ConfigError
 from dgae_jax.configs.resolved import ResolvedConfig
 from dgae_jax.run import terminal
 from dgae_jax.run.directory import InUseError
-from dgae_jax.run.options import RunOptions, from_dict, to_dict
+from dgae_jax.run.options import RunOptions, read_options, saved_options
 from dgae_jax.study.matrix import Cell, Study
 
 IN_USE_SECONDS = 300.0
@@ -41,7 +41,11 @@ def run(job: Job, cores: Sequence[int] = (), lifeline: int = subprocess.PIPE) ->
     It stops when the other end of `lifeline` is closed: by default, when this process ends.
     """
     options = json.dumps(
-        {**to_dict(job.options), "cache_dir": job.options.cache_dir, "inexact": job.options.inexact}
+        {
+            **saved_options(job.options),
+            "cache_dir": job.options.cache_dir,
+            "inexact": job.options.inexact,
+        }
     )
     words = [
         sys.executable,
@@ -74,7 +78,7 @@ def main() -> int:
     cell = next(each for each in study.cells if each.name == name)
     how = {"run_dir": study.run_dir(cell), "resume_or_start": True, "num_processes": 1}
     how |= {name: chosen[name] for name in ("cache_dir", "inexact")}
-    return _train(cell.config, dataclasses.replace(from_dict(chosen), **how))
+    return _train(cell.config, dataclasses.replace(read_options(chosen), **how))
 
 
 def _stop_when_left() -> None:
@@ -84,12 +88,12 @@ def _stop_when_left() -> None:
 
 
 def _train(config: ResolvedConfig, options: RunOptions) -> int:
-    from dgae_jax.run import loop
+    from dgae_jax.run import training
 
     since = time.monotonic()
     while True:
         try:
-            return loop.resume_or_start(config, options)
+            return training.train_command(config, options)
         except InUseError as reason:
             if time.monotonic() - since > IN_USE_SECONDS:
                 terminal.warn(f"error: {reason}")

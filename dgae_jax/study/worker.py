@@ -9,8 +9,8 @@ from optuna.storages import RDBStorage
 from optuna.trial import Trial, TrialState
 
 from dgae_jax.configs.config import ConfigError
-from dgae_jax.run import compiling, terminal
-from dgae_jax.run.signals import Signals, Stopped
+from dgae_jax.run import runtime, terminal
+from dgae_jax.run.runtime import Signals, Stopped
 from dgae_jax.run.training import RunError
 from dgae_jax.study import alone, side_by_side
 from dgae_jax.study.storage import alive, open_storage, open_study, requeue, unwarned
@@ -31,7 +31,7 @@ def serve(tuning: Tuning, worker: int) -> int:
     except (ConfigError, RunError) as reason:
         terminal.warn(f"stopped: {reason}")
         code = 1
-    if compiling.is_running():  # Python would wait for it
+    if runtime.is_compiling():  # Python would wait for it
         sys.stdout.flush()
         os._exit(code)
     return code

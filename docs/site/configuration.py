@@ -52,7 +52,7 @@ def page() -> str:
         "## What the presets change\n",
         "Against `Config()`:\n", _presets(),
         "## Where settings start\n", _fields(Arguments, only=names),
-        "## What a run leaves\n", (RunOptions.__doc__ or "") + "\n", _fields(RunOptions, allowed=options.WHOLE),
+        "## What a run leaves\n", (RunOptions.__doc__ or "") + "\n", _fields(RunOptions, allowed=options.INTEGER_RANGES),
     ]  # fmt: skip
     return "\n".join(sections).rstrip() + "\n"
 

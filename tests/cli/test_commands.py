@@ -14,8 +14,8 @@ import pytest
 from dgae_jax.cli import arguments
 from dgae_jax.cli.main import COMMANDS
 from dgae_jax.cli.train import parsed
-from dgae_jax.run import compiling, directory, metrics
-from dgae_jax.run.options import SINKS
+from dgae_jax.run import directory, metrics, runtime
+from dgae_jax.run.options import METRIC_LOGGERS
 from tests.helpers import ROOT, TINY, command
 
 
@@ -288,7 +288,7 @@ def test_a_command_that_leaves_a_compiler_to_itself_ends_before_that_aborts_it(m
     codes, idle = [], threading.Event()
     monkeypatch.setattr(os, "_exit", codes.append)
     assert (arguments.stopped("stopped"), codes) == (130, [])
-    left = threading.Thread(target=idle.wait, name=compiling.THREAD, daemon=True)
+    left = threading.Thread(target=idle.wait, name=runtime.COMPILER_THREAD, daemon=True)
     left.start()
     arguments.stopped("stopped")
     idle.set()
@@ -325,7 +325,7 @@ def test_viewers_are_named_behind_one_flag_and_a_missing_one_is_refused_in_one_l
 ):
     assert parsed(["--log", "tensorboard"])[1].log == ("tensorboard",)
     assert parsed(["--log", "--env", "hopper"])[1].log == ()
-    monkeypatch.setitem(SINKS, "wandb", "a_library_that_nobody_has")
+    monkeypatch.setitem(METRIC_LOGGERS, "wandb", "a_library_that_nobody_has")
     code, out, err = run("train", "--log", "tensorboard", "wandb", "--run-dir", tmp_path / "run")
     assert (code, out) == (2, "")
     assert (

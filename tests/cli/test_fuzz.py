@@ -16,9 +16,9 @@ from dgae_jax.cli.train import parsed
 from dgae_jax.configs.config import ConfigError
 from dgae_jax.configs.resolved import resolve
 from dgae_jax.configs.serial import from_dict, to_dict
-from dgae_jax.run import checkpoint, files, manifest, metrics
+from dgae_jax.run import checkpoint, directory, files, metrics
 from dgae_jax.run.checkpoint import CheckpointError
-from dgae_jax.run.evaluations import EvaluationsFile
+from dgae_jax.run.metrics import EvaluationsFile
 from dgae_jax.run.options import RunOptions
 from tests.helpers import signed
 
@@ -170,9 +170,9 @@ MANIFEST = st.fixed_dictionaries(
 def test_any_manifest_is_another_machine_and_can_be_added_to(tmp_path_factory, data, noise):
     run_dir = tmp_path_factory.mktemp("manifest")
     (run_dir / "manifest.json").write_bytes(json.dumps(data).encode() + noise)
-    assert manifest.changes(run_dir, RunOptions())
-    manifest.add(run_dir, manifest.options(run_dir))
-    assert manifest.changes(run_dir, manifest.options(run_dir)) == []
+    assert directory.environment_changes(run_dir, RunOptions())
+    directory.extend_manifest(run_dir, directory.saved_options(run_dir))
+    assert directory.environment_changes(run_dir, directory.saved_options(run_dir)) == []
 
 
 BODY = msgpack.packb(

@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 
 from dgae_jax.cli import export
-from dgae_jax.run import restore
+from dgae_jax.run import checkpoint
 from dgae_jax.run.directory import read_config
-from dgae_jax.run.loop import train
+from dgae_jax.run.training import train_command
 from tests.helpers import ROOT
 from tests.runs import QUIET, last, small
 
@@ -21,7 +21,7 @@ from tests.runs import QUIET, last, small
 @pytest.fixture(scope="module")
 def trained(tmp_path_factory):
     run_dir = tmp_path_factory.mktemp("runs") / "ppo"
-    train(small("ppo", seeds=2), dataclasses.replace(QUIET, run_dir=run_dir))
+    train_command(small("ppo", seeds=2), dataclasses.replace(QUIET, run_dir=run_dir))
     return run_dir
 
 
@@ -72,8 +72,8 @@ def test_a_policys_file_is_exported_beside_it_and_again_over_it(run_dir, run, tm
     config = read_config(run_dir)
     file = tmp_path / "policies" / "hopper.msgpack"
     file.parent.mkdir()
-    found = restore.trained(run_dir, config, "latest")
-    restore.save_networks(file, config, found, restore.reward_std(found.path, config))
+    found = checkpoint.load_networks(run_dir, config, "latest")
+    checkpoint.save_networks(file, config, found, checkpoint.reward_std(found.path, config))
     for _ in range(2):
         code, out, err = run(file, "--to", "npz", "npz")
         where = tmp_path / "policies" / "hopper-export" / "npz"

@@ -21,9 +21,9 @@ from dgae_jax.configs.resolved import resolve
 from dgae_jax.export import arrays, bundle, card
 from dgae_jax.export.facts import facts_of
 from dgae_jax.export.outside.policy import Policy
-from dgae_jax.run import restore
+from dgae_jax.run import checkpoint
 from dgae_jax.run.evaluation import evaluate_policies
-from dgae_jax.run.loop import train
+from dgae_jax.run.training import train_command
 from tests.helpers import ROOT
 from tests.runs import QUIET, last, small
 
@@ -69,7 +69,7 @@ INDEX = {"quantile": 0, "scalar": 1, "ordered": 0, "sorted": 0}
 def runs(tmp_path_factory):
     made = {name: tmp_path_factory.mktemp("runs") / name for name in CONFIGS}
     for name, run_dir in made.items():
-        train(CONFIGS[name], dataclasses.replace(QUIET, run_dir=run_dir))
+        train_command(CONFIGS[name], dataclasses.replace(QUIET, run_dir=run_dir))
     return made
 
 
@@ -78,7 +78,7 @@ def exported(request, runs, tmp_path_factory):
     """A policy's file with loud actions, exported in every format: name, policy, observations, directory."""
     name, directory = request.param, tmp_path_factory.mktemp("exported")
     config, index = CONFIGS[name], INDEX[request.param]
-    found = restore.trained(runs[name], config, "latest")
+    found = checkpoint.load_networks(runs[name], config, "latest")
     head = found.policy.params["params"]["Dense_0"]
     params = {
         "params": {
@@ -88,7 +88,7 @@ def exported(request, runs, tmp_path_factory):
     }
     file = directory / "loud.msgpack"
     loud = found._replace(policy=found.policy._replace(params=params))
-    restore.save_networks(file, config, loud, restore.reward_std(found.path, config))
+    checkpoint.save_networks(file, config, loud, checkpoint.reward_std(found.path, config))
     bundle.export(file, config, "latest", index, tuple(bundle.FILES), directory)
     statistics = found.policy.observations
     mean, std = (
@@ -178,7 +178,7 @@ def test_the_agent_plays_the_episodes_of_an_evaluation_without_jax(name, runs, t
     config, index = CONFIGS[name], INDEX[name]
     bundle.export(runs[name], config, "latest", index, ["gymnasium"], tmp_path)
     out = outside(tmp_path / "gymnasium", "agent.py", "--episodes", "4", "--seed", "3").splitlines()
-    policies = restore.trained(runs[name], config, "latest").policy
+    policies = checkpoint.load_networks(runs[name], config, "latest").policy
     want = evaluate_policies(policies, config, engine="gymnasium", episodes=4, seed=3)["seeds"][
         index
     ]
@@ -209,7 +209,7 @@ def test_the_agent_refuses_what_cannot_be_played(argv, runs, tmp_path):
 
 def test_the_arrays_are_those_of_the_checkpoint_and_the_task(runs):
     config = CONFIGS["quantile"]
-    found = restore.trained(runs["quantile"], config, "latest")
+    found = checkpoint.load_networks(runs["quantile"], config, "latest")
     made = arrays.arrays_of(found, config, 0)
     world = gymnasium.make("Hopper-v5").action_space
     np.testing.assert_array_equal(
@@ -250,7 +250,7 @@ def test_a_policy_by_hand():
 
 def test_networks_of_another_make_are_refused(runs):
     config = CONFIGS["quantile"]
-    found = restore.trained(runs["quantile"], config, "latest")
+    found = checkpoint.load_networks(runs["quantile"], config, "latest")
     strange = found._replace(
         policy=found.policy._replace(params={"params": {"Body": found.policy.params["params"]}})
     )
@@ -303,7 +303,7 @@ def test_a_card_has_the_licence_of_the_package_and_the_noise_of_the_training(run
         CONFIGS["scalar"],
         facts_of(runs["scalar"], last(runs["scalar"]), CONFIGS["scalar"], 1),
     )
-    plain = arrays.arrays_of(restore.trained(runs["scalar"], config, "latest"), config, 1)
+    plain = arrays.arrays_of(checkpoint.load_networks(runs["scalar"], config, "latest"), config, 1)
     quiet, noisy = (
         card.card("npz", plain, dataclasses.replace(config, noise=noise), 1, made, "latest")
         for noise in (dg.NoiseConfig(), dg.NoiseConfig(reward=0.5, initial=0.01))

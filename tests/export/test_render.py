@@ -13,9 +13,9 @@ import pytest
 from PIL import Image, ImageSequence
 
 from dgae_jax.export import gl, strip
-from dgae_jax.run import restore
+from dgae_jax.run import checkpoint
 from dgae_jax.run.directory import read_config
-from dgae_jax.run.loop import train
+from dgae_jax.run.training import train_command
 from tests.helpers import ROOT, command, film_of
 from tests.runs import QUIET, last, small
 
@@ -31,7 +31,7 @@ def opengl():
 
 def made(tmp_path_factory, algo):
     run_dir = tmp_path_factory.mktemp("runs") / algo
-    train(small(algo), dataclasses.replace(QUIET, run_dir=run_dir))
+    train_command(small(algo), dataclasses.replace(QUIET, run_dir=run_dir))
     return run_dir
 
 
@@ -148,8 +148,8 @@ def test_the_file_of_a_policy_is_filmed_beside_it_and_has_nothing_to_show_from_i
     distributional, tmp_path, opengl, run
 ):
     config, file = read_config(distributional), tmp_path / "policy.msgpack"
-    found = restore.trained(distributional, config, "latest")
-    restore.save_networks(file, config, found, restore.reward_std(found.path, config))
+    found = checkpoint.load_networks(distributional, config, "latest")
+    checkpoint.save_networks(file, config, found, checkpoint.reward_std(found.path, config))
     dgae("render", file, "--format", "gif", *SMALL)
     assert length(tmp_path / "policy-film.gif") > 0
     assert run("render", file, "--during")[::2] == (
@@ -161,26 +161,28 @@ def test_the_file_of_a_policy_is_filmed_beside_it_and_has_nothing_to_show_from_i
 def test_every_checkpoint_is_found_and_a_damaged_one_left_out(distributional, tmp_path, capsys):
     config = read_config(distributional)
     names = [f"steps_{steps:012d}.msgpack" for steps in (256, 512)]
-    assert [found.path.name for found in restore.kept(distributional, config)] == [
+    assert [found.path.name for found in checkpoint.load_all_networks(distributional, config)] == [
         "steps_000000000256.msgpack",
         "steps_000000000512.msgpack",
     ]
     shutil.copytree(distributional, tmp_path / "run")
     latest = last(tmp_path / "run")
     latest.write_bytes(latest.read_bytes()[:-100])
-    assert [found.path.name for found in restore.kept(tmp_path / "run", config)] == names[:1]
+    assert [
+        found.path.name for found in checkpoint.load_all_networks(tmp_path / "run", config)
+    ] == names[:1]
     assert re.fullmatch(r"warning: .*000512\.msgpack.*; left out\n", capsys.readouterr().err)
 
 
 def test_the_scale_of_rewards_is_that_of_the_training_state(distributional):
     config = read_config(distributional)
-    state, path = restore.training_state(distributional, config)
-    std = restore.reward_std(path, config)
+    state, path = checkpoint.latest_train_state(distributional, config)
+    std = checkpoint.reward_std(path, config)
     np.testing.assert_array_equal(std, state.reward_scale.returns.std)
     assert std.shape == (1,)
     assert std[0] != 1
     unscaled = dataclasses.replace(config, normalize_rewards=False)
-    np.testing.assert_array_equal(restore.reward_std(path, unscaled), [1])
+    np.testing.assert_array_equal(checkpoint.reward_std(path, unscaled), [1])
 
 
 @pytest.mark.parametrize(

@@ -8,7 +8,7 @@ import pytest
 
 from dgae_jax.learn.build import make_task, make_trainer, seed_keys
 from dgae_jax.run import training
-from dgae_jax.run.loop import train
+from dgae_jax.run.training import train_command
 from tests.runs import QUIET, SMALL, small
 
 
@@ -29,7 +29,7 @@ def state():
 @pytest.fixture(scope="session")
 def finished(tmp_path_factory):
     run_dir = tmp_path_factory.mktemp("runs") / "finished"
-    train(small(), dataclasses.replace(QUIET, run_dir=run_dir))
+    train_command(small(), dataclasses.replace(QUIET, run_dir=run_dir))
     return run_dir
 
 

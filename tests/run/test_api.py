@@ -10,8 +10,7 @@ import pytest
 
 from dgae_jax.configs.config import ConfigError, NoiseConfig
 from dgae_jax.learn.build import make_greedy, make_task
-from dgae_jax.run import api, directory, restore
-from dgae_jax.run import record as record_module
+from dgae_jax.run import api, checkpoint, directory, logger
 from dgae_jax.run.api import load_policy, train
 from dgae_jax.run.evaluation import evaluate_policies
 from dgae_jax.run.training import RunError
@@ -95,14 +94,14 @@ def test_an_invalid_setting_is_refused_before_anything_is_written(
 
 def test_a_signal_is_an_exception_that_names_the_directory_to_go_on_in(tmp_path, monkeypatch):
     monkeypatch.setattr(api.tempfile, "tempdir", str(tmp_path))
-    honest = record_module.evaluate_policies
+    honest = logger.evaluate_policies
 
     def interrupted(*args, **how):
         signal.raise_signal(signal.SIGTERM)
         honest(*args, **how)
         pytest.fail("the evaluation went on")
 
-    monkeypatch.setattr(record_module, "evaluate_policies", interrupted)
+    monkeypatch.setattr(logger, "evaluate_policies", interrupted)
     with pytest.raises(RunError, match="stopped by SIGTERM; continue with --resume ") as caught:
         train(small(), quiet=True, **CHOSEN)
     assert caught.value.exit_code == 143
@@ -128,7 +127,7 @@ def test_observations_of_another_size_are_refused(shape, finished):
 
 def test_a_policy_does_what_evaluations_play(finished, monkeypatch):
     config, seen = directory.read_config(finished), []
-    policies = restore.trained(finished, config, "latest").policy
+    policies = checkpoint.load_networks(finished, config, "latest").policy
     greedy = jax.jit(make_greedy(make_task(config), config))
 
     def watched(policy, obs):

@@ -12,10 +12,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from dgae_jax.run import directory, metrics, restore, training
-from dgae_jax.run import record as record_module
-from dgae_jax.run.loop import resume, train
-from dgae_jax.run.record import Record
+from dgae_jax.run import checkpoint, directory, logger, metrics, training
+from dgae_jax.run.logger import RunLogger
+from dgae_jax.run.training import train_command
 from tests.runs import QUIET, SMALL, last, small, timeless
 
 
@@ -41,14 +40,14 @@ def test_a_signal_in_an_evaluation_breaks_it_off_and_the_run_goes_on_later_to_th
             pytest.fail("the evaluation went on")
         return honest(*args, **how)
 
-    honest = record_module.evaluate_policies
+    honest = logger.evaluate_policies
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(record_module, "evaluate_policies", interrupted)
-        assert train(config, dataclasses.replace(QUIET, run_dir=run_dir)) == code
+        patch.setattr(logger, "evaluate_policies", interrupted)
+        assert train_command(config, dataclasses.replace(QUIET, run_dir=run_dir)) == code
     assert f"stopped by {kind.name}; continue with --resume {run_dir}" in capsys.readouterr().out
     assert len(calls) == evaluation
     assert not (run_dir / "evaluation.json").exists()
-    assert resume(config, dataclasses.replace(QUIET, resume=run_dir)) == 0
+    assert train_command(config, dataclasses.replace(QUIET, resume=run_dir)) == 0
     assert last(run_dir).read_bytes() == last(finished).read_bytes()
     assert timeless(run_dir) == timeless(finished)
     assert (run_dir / "evaluations.jsonl").read_bytes() == (
@@ -57,7 +56,7 @@ def test_a_signal_in_an_evaluation_breaks_it_off_and_the_run_goes_on_later_to_th
 
 
 def test_a_directory_that_vanishes_while_it_trains_ends_the_run_in_one_line(tmp_path, capsys):
-    run_dir, honest = tmp_path / "run", Record.append
+    run_dir, honest = tmp_path / "run", RunLogger.append
 
     def append(record, *args):
         if record.steps == 64:  # no checkpoint yet, nothing on its way
@@ -65,8 +64,8 @@ def test_a_directory_that_vanishes_while_it_trains_ends_the_run_in_one_line(tmp_
         return honest(record, *args)
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(Record, "append", append)
-        assert train(small(), dataclasses.replace(QUIET, run_dir=run_dir)) == 1
+        patch.setattr(RunLogger, "append", append)
+        assert train_command(small(), dataclasses.replace(QUIET, run_dir=run_dir)) == 1
     error = f"stopped: {run_dir}/metrics.jsonl: cannot be written (No such file or directory); there is no checkpoint\n"
     assert capsys.readouterr().err == error
     assert not run_dir.exists()
@@ -97,7 +96,7 @@ def test_a_disk_that_takes_no_more_ends_the_run_in_one_line_and_it_goes_on_later
         < (finished / "curve.png").stat().st_size
     )
     with no_file_larger_than(int(share * size)):
-        assert train(small(), dataclasses.replace(QUIET, run_dir=run_dir)) == 1
+        assert train_command(small(), dataclasses.replace(QUIET, run_dir=run_dir)) == 1
     left = (
         f"continue from {last(run_dir).name} with --resume {run_dir}"
         if share > 1
@@ -108,7 +107,7 @@ def test_a_disk_that_takes_no_more_ends_the_run_in_one_line_and_it_goes_on_later
         == f"stopped: {run_dir}/{name}: cannot be written (File too large); {left}\n"
     )
     assert not list(run_dir.rglob("*.part"))
-    assert resume(small(), dataclasses.replace(QUIET, resume=run_dir)) == 0
+    assert train_command(small(), dataclasses.replace(QUIET, resume=run_dir)) == 0
     assert last(run_dir).read_bytes() == last(finished).read_bytes()
     assert timeless(run_dir) == timeless(finished)
 
@@ -120,11 +119,13 @@ def test_updates_that_are_not_finite_are_left_out_and_counted_and_end_the_run_wh
         small(), policy=dataclasses.replace(SMALL.policy, learning_rate=1e30, max_grad_norm=1e30)
     )
     options = dataclasses.replace(QUIET, run_dir=tmp_path / "run", max_nonfinite=3)
-    assert train(broken, options) == 1
+    assert train_command(broken, options) == 1
     assert "updates were not finite and were left out" in capsys.readouterr().err
     rows = metrics.read(tmp_path / "run" / "metrics.jsonl")
     assert sum(row["skipped"] for row in rows) >= 3
-    state, _ = restore.training_state(tmp_path / "run", directory.read_config(tmp_path / "run"))
+    state, _ = checkpoint.latest_train_state(
+        tmp_path / "run", directory.read_config(tmp_path / "run")
+    )
     assert all(
         jnp.isfinite(x).all()
         for fit in (state.policy, state.critic)
@@ -170,12 +171,12 @@ def test_an_allocation_that_fails_later_is_one_line_that_names_the_checkpoint_an
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(training, "make_trainer", exhausted)
-        assert train(small(), dataclasses.replace(QUIET, run_dir=run_dir)) == 1
+        assert train_command(small(), dataclasses.replace(QUIET, run_dir=run_dir)) == 1
     why = str(reason).partition("\n")[0] or "MemoryError"
     left = f"continue from {last(run_dir).name} with --resume {run_dir}"
     assert capsys.readouterr().err == f"stopped: out of memory ({why}); {left}\n"
     assert last(run_dir).name == f"steps_{timeless(run_dir)[-1]['steps']:012d}.msgpack"
-    assert resume(small(), dataclasses.replace(QUIET, resume=run_dir)) == 0
+    assert train_command(small(), dataclasses.replace(QUIET, resume=run_dir)) == 0
     assert last(run_dir).read_bytes() == last(finished).read_bytes()
     assert timeless(run_dir) == timeless(finished)
 
@@ -185,13 +186,13 @@ def test_an_error_that_is_none_of_memory_stays_what_it_is(tmp_path):
         raise jax.errors.JaxRuntimeError("INTERNAL: a bug")
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(record_module, "evaluate_policies", fails)
+        patch.setattr(logger, "evaluate_policies", fails)
         with pytest.raises(jax.errors.JaxRuntimeError, match="a bug"):
-            train(small(), dataclasses.replace(QUIET, run_dir=tmp_path / "run"))
+            train_command(small(), dataclasses.replace(QUIET, run_dir=tmp_path / "run"))
 
 
 def test_a_state_that_is_not_finite_ends_the_run_in_one_line_and_is_not_saved(tmp_path, capsys):
-    run_dir, honest = tmp_path / "run", Record.save
+    run_dir, honest = tmp_path / "run", RunLogger.save
 
     def save(record, state):
         if record.steps == 512:
@@ -201,8 +202,8 @@ def test_a_state_that_is_not_finite_ends_the_run_in_one_line_and_is_not_saved(tm
         honest(record, state)
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(Record, "save", save)
-        assert train(small(), dataclasses.replace(QUIET, run_dir=run_dir)) == 1
+        patch.setattr(RunLogger, "save", save)
+        assert train_command(small(), dataclasses.replace(QUIET, run_dir=run_dir)) == 1
     assert re.fullmatch(
         rf"stopped: observations\.\S+ is not finite after 512 samples, which is not saved; continue from steps_000000000256.msgpack"
         rf" with --resume {run_dir}\n",

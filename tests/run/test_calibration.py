@@ -10,7 +10,7 @@ import pytest
 from dgae_jax.cli import calibrate
 from dgae_jax.maths.transport import quantile_midpoints
 from dgae_jax.report import calibration as picture
-from dgae_jax.run import calibration, directory, loop, outcomes
+from dgae_jax.run import calibration, directory, training
 from tests import helpers, runs
 
 UNIFORM = jnp.tile(quantile_midpoints(100), (1000, 1, 1))
@@ -125,14 +125,14 @@ def test_runs_of_the_same_name_are_refused(tmp_path, monkeypatch, capsys):
 def test_the_command_writes_the_statistics_of_every_run_and_a_picture(
     tmp_path, monkeypatch, capsys
 ):
-    loop.start(runs.small("dppo"), dataclasses.replace(runs.QUIET, run_dir=tmp_path / "run"))
+    training.train(runs.small("dppo"), dataclasses.replace(runs.QUIET, run_dir=tmp_path / "run"))
     monkeypatch.setattr(
         "sys.argv", ["dgae calibrate", str(tmp_path / "run"), "--cache-dir", runs.QUIET.cache_dir]
     )
     assert helpers.command("calibrate")() == 0
     found = json.loads((tmp_path / "run" / "calibration.json").read_text())["run"]
     assert (
-        found["samples"] == calibration.WORLDS * outcomes.CHUNK
+        found["samples"] == calibration.WORLDS * calibration.CHUNK
     )  # episodes of 20 steps, in whole chunks
     assert np.isfinite(
         [*found["pit"], found["rmse"], found["crps"], *found["similar_means"].values()]

@@ -82,7 +82,7 @@ def test_a_checkpoint_saved_behind_damaged_ones_is_kept(state, tmp_path):
     for damaged in (192, 256):
         (tmp_path / f"steps_{damaged:012d}.msgpack").write_bytes(b"")
     saved(state, tmp_path, 160, keep=1)
-    assert [int(p.stem[6:]) for p in checkpoint.found(tmp_path)] == [160, 192, 256]
+    assert [int(p.stem[6:]) for p in checkpoint.checkpoints_in(tmp_path)] == [160, 192, 256]
 
 
 def array(shape=(2,), dtype="float32", data=bytes(8)):

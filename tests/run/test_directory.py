@@ -15,8 +15,8 @@ import dgae_jax as dg
 from dgae_jax.configs.config import ConfigError
 from dgae_jax.configs.serial import to_dict
 from dgae_jax.run import directory, files
-from dgae_jax.run.loop import resume, train
 from dgae_jax.run.options import RunOptions
+from dgae_jax.run.training import train_command
 from tests.helpers import ROOT
 from tests.runs import QUIET, SMALL, small
 
@@ -64,7 +64,7 @@ def test_a_directory_in_use_is_refused_and_left_alone_also_while_its_configurati
     with directory.locked(run_dir):
         directory.write_config(run_dir, directory.read_config(run_dir))
         with pytest.raises(ConfigError, match="another process is training there"):
-            resume(small(), dataclasses.replace(QUIET, resume=run_dir))
+            train_command(small(), dataclasses.replace(QUIET, resume=run_dir))
     with directory.locked(run_dir):
         pass
 
@@ -89,9 +89,9 @@ def test_a_directory_that_cannot_be_written_is_one_clear_line(run_dir):
             ConfigError, match=r"must be a directory that can be written.*Permission denied"
         ),
     ):
-        train(small(), dataclasses.replace(QUIET, run_dir=run_dir / "below"))
+        train_command(small(), dataclasses.replace(QUIET, run_dir=run_dir / "below"))
     with without_rights(run_dir), pytest.raises(ConfigError, match="Permission denied"):
-        resume(small(), dataclasses.replace(QUIET, resume=run_dir))
+        train_command(small(), dataclasses.replace(QUIET, resume=run_dir))
 
 
 PARTS = [
@@ -114,7 +114,7 @@ def test_a_run_directory_with_a_link_in_it_is_refused_and_nothing_is_touched(
         ConfigError,
         match=rf"run/{name}: must be a (file|directory) in the run directory itself, not a link",
     ):
-        resume(directory.read_config(run_dir), dataclasses.replace(QUIET, resume=run_dir))
+        train_command(directory.read_config(run_dir), dataclasses.replace(QUIET, resume=run_dir))
     assert sorted((p, p.lstat().st_mtime_ns) for p in tmp_path.rglob("*")) == before
 
 
@@ -132,7 +132,7 @@ def test_links_where_whole_files_are_written_are_replaced_and_not_followed(name,
     (tmp_path / "outside").write_text("mine")
     (run_dir / name).unlink(missing_ok=True)
     (run_dir / name).symlink_to(tmp_path / "outside")
-    assert resume(small(), dataclasses.replace(QUIET, resume=run_dir)) == 0
+    assert train_command(small(), dataclasses.replace(QUIET, resume=run_dir)) == 0
     assert (tmp_path / "outside").read_text() == "mine"
     assert not (run_dir / name).is_symlink()
 

@@ -8,10 +8,16 @@ import pytest
 import dgae_jax as dg
 from dgae_jax.configs.config import ConfigError
 from dgae_jax.learn.build import make_task, make_trainer, policies_of, seed_keys
-from dgae_jax.run.engines import engines_of
-from dgae_jax.run.evaluation import default_path, episode_seeds, evaluate_policies
-from dgae_jax.run.evaluations import EvaluationsFile
-from dgae_jax.run.summary import describe, over_seeds, summary
+from dgae_jax.run.evaluation import (
+    default_path,
+    describe,
+    episode_seeds,
+    evaluate_policies,
+    seed_statistics,
+    summary,
+)
+from dgae_jax.run.metrics import EvaluationsFile
+from dgae_jax.run.options import engines_of
 from tests.runs import SMALL
 
 
@@ -114,7 +120,9 @@ def test_an_episode_has_at_most_episode_length_steps(state):
 
 def test_of_several_seeds_the_mean_is_printed_with_its_spread_over_seeds():
     # means 10, 20, 30: standard deviation 10 (n - 1); a resample's mean lies between 10 and 30
-    result = over_seeds([np.array([9.0, 11.0]), np.array([20.0, 20.0]), np.array([30.0, 30.0])])
+    result = seed_statistics(
+        [np.array([9.0, 11.0]), np.array([20.0, 20.0]), np.array([30.0, 30.0])]
+    )
     assert (result["seeds_mean"], result["seeds_std"], result["iqm"]) == (20, 10, 20)
     assert 10 <= result["interval"][0] < 20 < result["interval"][1] <= 30
     text = describe(

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from dgae_jax.run import files
-from dgae_jax.run.evaluations import EvaluationsFile
+from dgae_jax.run.metrics import EvaluationsFile
 
 EVALUATIONS = [
     {"steps": steps, "seed": seed, "return_mean": mean, "return_std": 1.0}

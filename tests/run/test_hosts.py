@@ -11,7 +11,7 @@ import jax
 import numpy as np
 import pytest
 
-from dgae_jax.run import checkpoint, directory, hosts, restore
+from dgae_jax.run import checkpoint, directory, runtime
 from dgae_jax.run.options import RunOptions
 from tests.helpers import ROOT, TINY
 from tests.runs import last, stopped_half_way, timeless
@@ -50,7 +50,7 @@ def whole(tmp_path_factory):
 
 
 def arrays(run_dir):
-    state, _ = restore.training_state(run_dir, directory.read_config(run_dir))
+    state, _ = checkpoint.latest_train_state(run_dir, directory.read_config(run_dir))
     return checkpoint.arrays_of(state)
 
 
@@ -154,7 +154,7 @@ def test_processes_are_expected_where_a_scheduler_started_several(
         monkeypatch.setenv(name, value)
     met = []
     monkeypatch.setattr(jax.distributed, "initialize", lambda *where: met.append(where))
-    hosts.join(RunOptions())
+    runtime.join_processes(RunOptions())
     assert met == ([(None, None, None)] if several else [])
-    hosts.join(RunOptions(num_processes=1))
+    runtime.join_processes(RunOptions(num_processes=1))
     assert len(met) == several

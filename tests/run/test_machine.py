@@ -4,7 +4,7 @@ import jax
 import pytest
 
 from dgae_jax.configs.config import ConfigError
-from dgae_jax.run import machine
+from dgae_jax.run import runtime
 from dgae_jax.run.options import RunOptions
 from tests.runs import SMALL
 
@@ -33,4 +33,4 @@ def test_whatever_jax_says_about_a_device_is_one_line_that_says_how_to_install_f
         ConfigError,
         match=rf"^JAX_PLATFORMS={wanted}: must name a device that JAX finds here, .*{said}",
     ):
-        machine.use_devices(SMALL, RunOptions())
+        runtime.use_devices(SMALL, RunOptions())

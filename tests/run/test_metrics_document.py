@@ -8,7 +8,7 @@ import pytest
 from dgae_jax.configs.algorithms import ALGORITHMS
 from dgae_jax.configs.resolved import resolve
 from dgae_jax.run import metrics
-from dgae_jax.run.loop import train
+from dgae_jax.run.training import train_command
 from tests.helpers import ROOT
 from tests.runs import QUIET, small
 
@@ -41,7 +41,7 @@ def run(request, tmp_path_factory):
     }
     config = resolve(dataclasses.replace(config, **shape))
     run_dir = tmp_path_factory.mktemp("runs") / "run"
-    assert train(config, dataclasses.replace(QUIET, run_dir=run_dir)) == 0
+    assert train_command(config, dataclasses.replace(QUIET, run_dir=run_dir)) == 0
     return (
         config,
         metrics.read(run_dir / "metrics.jsonl"),

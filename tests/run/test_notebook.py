@@ -9,9 +9,8 @@ import numpy as np
 import pytest
 from matplotlib.image import imread
 
-from dgae_jax.run import curve, notebook, terminal
-from dgae_jax.run.notebook import Page
-from dgae_jax.run.progress import Reporter
+from dgae_jax.run import metrics, terminal
+from dgae_jax.run.terminal import Page, Reporter
 from tests.runs import ITERATIONS
 
 PROGRAM = f"""
@@ -51,25 +50,25 @@ def cell(monkeypatch):
 
 
 def test_a_kernel_that_may_speak_has_a_page_and_nothing_else_has(cell, monkeypatch):
-    assert notebook.is_there()
+    assert terminal.in_notebook()
     with terminal.silenced():
-        assert not notebook.is_there()
+        assert not terminal.in_notebook()
     monkeypatch.setattr(
         sys.modules["IPython"], "get_ipython", lambda: SimpleNamespace()
     )  # IPython on a terminal
-    assert not notebook.is_there()
+    assert not terminal.in_notebook()
     monkeypatch.setattr(
         sys.modules["IPython"], "get_ipython", lambda: None
     )  # imported by a program
-    assert not notebook.is_there()
+    assert not terminal.in_notebook()
     monkeypatch.delitem(sys.modules, "IPython")
-    assert not notebook.is_there()
+    assert not terminal.in_notebook()
     assert "IPython" not in sys.modules
 
 
 def test_one_output_has_words_until_there_is_a_return_and_then_the_curve(cell, capsys):
     figures = iter(
-        [None, *(curve.learning_curve(np.arange(3), np.ones((3, 1)), "a run") for _ in range(2))]
+        [None, *(metrics.learning_curve(np.arange(3), np.ones((3, 1)), "a run") for _ in range(2))]
     )
     with Reporter(100, page=Page(lambda: next(figures))) as reporter:
         reporter.announce("compiling")
@@ -80,7 +79,7 @@ def test_one_output_has_words_until_there_is_a_return_and_then_the_curve(cell, c
     assert words == {"text/plain": "compiling"}
     assert first["text/plain"] == "a run 10 of 100 steps"
     assert last["text/plain"] == "a run"
-    assert shown == {"image/png": {"width": notebook.WIDTH}}
+    assert shown == {"image/png": {"width": terminal.WIDTH}}
     pictures = [imread(io.BytesIO(base64.b64decode(each["image/png"]))) for each in (first, last)]
     assert pictures[0].shape == pictures[1].shape == (600, 960, 4)
     assert not np.array_equal(*pictures)  # the words are in the picture
@@ -93,7 +92,7 @@ def test_drawing_takes_a_tenth_of_the_time_at_most(cell, monkeypatch):
     def draw():
         now[0] += 2.0  # a slow machine
 
-    monkeypatch.setattr(notebook.time, "monotonic", lambda: now[0])
+    monkeypatch.setattr(terminal.time, "monotonic", lambda: now[0])
     page = Page(draw)
     for now[0] in np.arange(0.0, 101.0):
         page.show("words")

@@ -12,10 +12,9 @@ from numpy.testing import assert_array_equal
 import dgae_jax as dg
 from dgae_jax.configs.config import ConfigError
 from dgae_jax.configs.resolved import resolve
-from dgae_jax.run import loop, restore
-from dgae_jax.run.engines import engines_of
+from dgae_jax.run import checkpoint, training
 from dgae_jax.run.evaluation import time_limit
-from dgae_jax.run.options import RunOptions
+from dgae_jax.run.options import RunOptions, engines_of
 from tests.helpers import command
 from tests.probes import Counter, Target
 from tests.runs import QUIET, small
@@ -45,7 +44,7 @@ def test_what_cannot_work_in_gymnasium_is_refused_before_anything_is_written(
 ):
     config = PENDULUM if options else dataclasses.replace(PENDULUM, env="gymnasium:Nope-v1")
     with pytest.raises(ConfigError, match=message):
-        loop.start(
+        training.train(
             config, RunOptions(run_dir=tmp_path / "run", cache_dir=QUIET.cache_dir, **options)
         )
     assert list(tmp_path.iterdir()) == []
@@ -110,11 +109,11 @@ def test_a_run_in_gymnasium_is_the_same_again_and_goes_on_in_new_episodes_if_ask
         ConfigError,
         match="must be with --inexact; the worlds of gymnasium:Pendulum-v1 are not in a checkpoint",
     ):
-        loop.go_on(longer, options)
-    loop.go_on(longer, dataclasses.replace(options, inexact=True))
+        training.train(longer, options)
+    training.train(longer, dataclasses.replace(options, inexact=True))
     assert "begin new episodes, so the rest is another sample" in capsys.readouterr().err
     assert len((tmp_path / "a" / "metrics.jsonl").read_text().splitlines()) == 4
-    state, _ = restore.training_state(tmp_path / "a", resolve(longer))
+    state, _ = checkpoint.latest_train_state(tmp_path / "a", resolve(longer))
     assert_array_equal(state.episodes.steps, np.full((2, 4), 16))  # 32 if they had gone on
 
 

@@ -9,7 +9,7 @@ import time
 
 import pytest
 
-from dgae_jax.run import directory, metrics, restore
+from dgae_jax.run import checkpoint, directory, metrics
 from tests.helpers import ROOT, TINY
 from tests.runs import last, timeless
 
@@ -97,7 +97,7 @@ def test_a_signal_saves_within_half_a_minute_and_a_second_one_ends_at_once(kind,
         )
         if signals == 1:
             assert f"continue with --resume {run_dir}" in out
-    state, _ = restore.training_state(run_dir, directory.read_config(run_dir))
+    state, _ = checkpoint.latest_train_state(run_dir, directory.read_config(run_dir))
     assert int(state.iteration[0]) >= 1
 
 

@@ -6,9 +6,9 @@ import jax
 import numpy as np
 
 from dgae_jax.learn.build import make_task
-from dgae_jax.run import checkpoint, record
+from dgae_jax.run import checkpoint, logger
+from dgae_jax.run.logger import RunLogger
 from dgae_jax.run.options import RunOptions
-from dgae_jax.run.record import Record
 from tests.runs import SMALL
 
 
@@ -23,7 +23,7 @@ def test_an_incident_can_be_replayed_from_its_file(state, tmp_path):
             incident=incident, nonfinite=state.episodes.nonfinite.at[0, 1].set(2)
         )
     )
-    record = Record(tmp_path, SMALL, RunOptions(debug_nonfinite=True), 0)
+    record = RunLogger(tmp_path, SMALL, RunOptions(debug_nonfinite=True), 0)
     row = {"episode_return": np.zeros((2, 1)), "nonfinite": np.array([[0.0], [2.0]])}
     record.append(broken, row, 1)
     assert not (tmp_path / "nonfinite").exists()
@@ -55,8 +55,8 @@ def test_an_evaluation_is_noted_when_its_checkpoint_is_on_the_disk(state, tmp_pa
 
     evaluation = {"seeds": [{"seed": 0, "return_mean": 1.0, "return_std": 0.0, "returns": [1.0]}]}
     monkeypatch.setattr(checkpoint, "save", slow)
-    monkeypatch.setattr(record, "evaluate_policies", lambda *_, **__: evaluation)
-    with Record(tmp_path, SMALL, RunOptions(), 0) as kept:
+    monkeypatch.setattr(logger, "evaluate_policies", lambda *_, **__: evaluation)
+    with RunLogger(tmp_path, SMALL, RunOptions(), 0) as kept:
         kept.save(state)
         kept.evaluate(None, print)
     assert seen == [b""]

@@ -11,7 +11,7 @@ import pytest
 
 import dgae_jax as dg
 from dgae_jax.maths.transport import quantile_midpoints
-from dgae_jax.run import checkpoint, directory, loop, outcomes, refit, restore
+from dgae_jax.run import calibration, checkpoint, directory, training
 from tests import helpers, runs
 
 POLICY = helpers.ROOT / "results" / "tuned" / "policies" / "hopper-dppo-1.msgpack"
@@ -19,9 +19,9 @@ POLICY = helpers.ROOT / "results" / "tuned" / "policies" / "hopper-dppo-1.msgpac
 
 
 def quantiles_after(obs, outcome):
-    samples = refit.Samples(obs[:, None], outcome)
-    network = refit.begun(samples, 16, hidden=(32,))
-    params = refit.fitted(network, samples, 200, jax.random.key(2))
+    samples = calibration.Samples(obs[:, None], outcome)
+    network = calibration.initial_network(samples, 16, hidden=(32,))
+    params = calibration.fit_quantiles(network, samples, 200, jax.random.key(2))
     return network.apply(params, jnp.array([[-1.0], [1.0]]))
 
 
@@ -51,7 +51,9 @@ def test_a_return_that_is_lost_one_time_in_four_is_lost_in_one_quantile_in_four(
 def test_the_policy_stays_as_it_is_and_the_file_is_loaded_calibrated_and_refitted_to_the_same_bits(
     algo, tmp_path, monkeypatch, capsys
 ):
-    loop.start(runs.small(algo, seeds=2), dataclasses.replace(runs.QUIET, run_dir=tmp_path / "run"))
+    training.train(
+        runs.small(algo, seeds=2), dataclasses.replace(runs.QUIET, run_dir=tmp_path / "run")
+    )
     config = directory.read_config(tmp_path / "run")
 
     def dgae(name, *argv):
@@ -63,7 +65,7 @@ def test_the_policy_stays_as_it_is_and_the_file_is_loaded_calibrated_and_refitte
 
     made = ("--index", "1", "--worlds", "16")
     file = tmp_path / "run" / "refit.msgpack"
-    assert f"fitted to {16 * outcomes.CHUNK:,} returns" in dgae("refit", tmp_path / "run", *made)
+    assert f"fitted to {16 * calibration.CHUNK:,} returns" in dgae("refit", tmp_path / "run", *made)
     whole, alone = (dg.load_policy(tmp_path / "run", seed=1), dg.load_policy(file))
     obs = np.random.default_rng(0).normal(size=(100, 11))
     np.testing.assert_array_equal(alone(obs), whole(obs))
@@ -72,7 +74,7 @@ def test_the_policy_stays_as_it_is_and_the_file_is_loaded_calibrated_and_refitte
 
     after = directory.config_of(file)
     assert (after.seed, after.num_seeds, after.critic.kind) == (config.seed + 1, 1, "sorted")
-    assert restore.reward_std(file, after) > 0
+    assert checkpoint.reward_std(file, after) > 0
     dgae("calibrate", file)
     found = json.loads((tmp_path / "run" / "refit-calibration.json").read_text())["refit.msgpack"]
     assert found["crossing"] == 0
@@ -159,7 +161,7 @@ def test_a_file_without_the_scale_of_its_rewards_is_not_compared_with_returns(
     monkeypatch, capsys, tmp_path
 ):
     config, file = directory.config_of(POLICY), tmp_path / "old.msgpack"
-    policy, critic, _ = restore.trained(POLICY, config, "latest")
+    policy, critic, _ = checkpoint.load_networks(POLICY, config, "latest")
     networks = {
         "policy": {"params": policy.params},
         "critic": {"params": critic.params},

@@ -8,9 +8,9 @@ from pathlib import Path
 import pytest
 
 from dgae_jax.configs.config import ConfigError
-from dgae_jax.run import directory, files, loop, manifest, metrics
-from dgae_jax.run.loop import resume, resume_or_start, train
+from dgae_jax.run import directory, files, metrics, training
 from dgae_jax.run.options import RunOptions
+from dgae_jax.run.training import train_command
 from tests.runs import QUIET, SMALL, last, small, stopped_half_way, timeless
 
 
@@ -30,9 +30,9 @@ def test_a_run_that_stopped_half_way_ends_with_the_same_bits_and_the_same_metric
     algo, physics, seeds, tmp_path
 ):
     whole, half, config = tmp_path / "whole", tmp_path / "half", small(algo, physics, seeds)
-    assert train(config, dataclasses.replace(QUIET, run_dir=whole)) == 0
+    assert train_command(config, dataclasses.replace(QUIET, run_dir=whole)) == 0
     stopped_half_way(whole, half)
-    assert resume(config, dataclasses.replace(QUIET, resume=half)) == 0
+    assert train_command(config, dataclasses.replace(QUIET, resume=half)) == 0
     assert last(half).read_bytes() == last(whole).read_bytes()
     assert timeless(half) == timeless(whole)
     for name in ("evaluation.json", "evaluations.jsonl"):
@@ -55,14 +55,16 @@ def test_a_run_that_stopped_half_way_ends_with_the_same_bits_and_the_same_metric
 )
 def test_a_changed_setting_is_refused_with_both_values(change, message, finished):
     with pytest.raises(ConfigError, match=message):
-        resume(dataclasses.replace(small(), **change), dataclasses.replace(QUIET, resume=finished))
+        train_command(
+            dataclasses.replace(small(), **change), dataclasses.replace(QUIET, resume=finished)
+        )
 
 
 def test_a_finished_run_may_be_given_a_larger_budget(finished, tmp_path):
     longer = tmp_path / "longer"
     shutil.copytree(finished, longer)
     config = dataclasses.replace(small(), total_steps=10 * SMALL.samples_per_iteration)
-    assert resume(config, dataclasses.replace(QUIET, resume=longer)) == 0
+    assert train_command(config, dataclasses.replace(QUIET, resume=longer)) == 0
     assert [row["iteration"] for row in metrics.read(longer / "metrics.jsonl")] == list(
         range(1, 11)
     )
@@ -74,7 +76,7 @@ def test_a_budget_below_what_is_done_is_refused(finished):
     with pytest.raises(
         ConfigError, match="total_steps 448: must be at least the 512 that are done"
     ):
-        resume(config, dataclasses.replace(QUIET, resume=finished))
+        train_command(config, dataclasses.replace(QUIET, resume=finished))
 
 
 @pytest.mark.parametrize(
@@ -97,16 +99,18 @@ def test_another_machine_or_version_is_refused_by_both_values_unless_asked_for_a
         ConfigError,
         match=rf"must go on where it began, or with --inexact; now {path[-1]} .* \(was {value}\)",
     ):
-        resume(small(), dataclasses.replace(QUIET, resume=run_dir))
-    assert resume(small(), dataclasses.replace(QUIET, resume=run_dir, inexact=True)) == 0
+        train_command(small(), dataclasses.replace(QUIET, resume=run_dir))
+    assert train_command(small(), dataclasses.replace(QUIET, resume=run_dir, inexact=True)) == 0
     assert f"(was {value}): rounding differs, by up to 1e-6 relative" in capsys.readouterr().err
-    assert resume(small(), dataclasses.replace(QUIET, resume=run_dir)) == 0  # where it was last
+    assert (
+        train_command(small(), dataclasses.replace(QUIET, resume=run_dir)) == 0
+    )  # where it was last
 
 
 @pytest.mark.slow
 def test_physics_may_change_if_asked_for_with_a_warning_that_names_the_tolerance(run_dir, capsys):
     other = dataclasses.replace(small("ppo", "jax"), total_steps=9 * 64)
-    assert resume(other, dataclasses.replace(QUIET, resume=run_dir, inexact=True)) == 0
+    assert train_command(other, dataclasses.replace(QUIET, resume=run_dir, inexact=True)) == 0
     assert (
         "warning: physics jax (was native): one step differs by up to 1e-4"
         in capsys.readouterr().err
@@ -120,7 +124,7 @@ def test_a_run_that_lost_its_checkpoints_is_refused_and_keeps_the_rest(run_dir):
     with pytest.raises(
         ConfigError, match=r"must hold a checkpoint; it had some when it was evaluated"
     ):
-        resume(small(), dataclasses.replace(QUIET, resume=run_dir))
+        train_command(small(), dataclasses.replace(QUIET, resume=run_dir))
     assert timeless(run_dir) == before
 
 
@@ -129,7 +133,7 @@ def test_a_run_that_is_refused_for_its_metrics_is_left_as_it_was(run_dir):
     (run_dir / "metrics.jsonl").write_text("".join(rows[:3]))
     before = {p: p.read_bytes() for p in run_dir.rglob("*") if p.is_file()}
     with pytest.raises(ConfigError, match="must hold the 8 iterations"):
-        resume(
+        train_command(
             dataclasses.replace(small(), total_steps=9999),
             dataclasses.replace(QUIET, resume=run_dir),
         )
@@ -137,11 +141,13 @@ def test_a_run_that_is_refused_for_its_metrics_is_left_as_it_was(run_dir):
 
 
 def test_a_resumed_run_goes_on_with_its_options(run_dir):
-    assert manifest.options(run_dir) == RunOptions(checkpoint_every=256, episodes=1, devices=1)
-    manifest.add(
+    assert directory.saved_options(run_dir) == RunOptions(
+        checkpoint_every=256, episodes=1, devices=1
+    )
+    directory.extend_manifest(
         run_dir, RunOptions(keep_checkpoints=7, eval_engine="native", debug_nonfinite=True)
     )
-    assert manifest.options(run_dir) == RunOptions(
+    assert directory.saved_options(run_dir) == RunOptions(
         keep_checkpoints=7, eval_engine="native", debug_nonfinite=True
     )
 
@@ -149,14 +155,14 @@ def test_a_resumed_run_goes_on_with_its_options(run_dir):
 def test_resume_or_start_starts_a_run_and_then_goes_on_with_it(finished, tmp_path):
     run_dir = tmp_path / "run"
     options = dataclasses.replace(QUIET, run_dir=run_dir, resume_or_start=True)
-    assert resume_or_start(small(), options) == 0
+    assert train_command(small(), options) == 0
     assert timeless(run_dir) == timeless(finished)
     last(run_dir).unlink()
-    assert resume_or_start(small(), options) == 0
+    assert train_command(small(), options) == 0
     assert last(run_dir).read_bytes() == last(finished).read_bytes()
     assert timeless(run_dir) == timeless(finished)
     with pytest.raises(ConfigError, match=r"gamma 0\.5: must be 0\.99 as in"):
-        resume_or_start(dataclasses.replace(small(), gamma=0.5), options)
+        train_command(dataclasses.replace(small(), gamma=0.5), options)
 
 
 @pytest.mark.parametrize(
@@ -174,7 +180,7 @@ def test_resume_or_start_starts_a_run_and_then_goes_on_with_it(finished, tmp_pat
 )
 def test_resume_or_start_needs_a_directory_and_no_other_way_to_resume(options, message):
     with pytest.raises(ConfigError, match=message):
-        resume_or_start(small(), dataclasses.replace(QUIET, **options))
+        train_command(small(), dataclasses.replace(QUIET, **options))
 
 
 def test_who_heeds_the_evaluations_may_end_a_run_which_then_goes_on_as_if_it_had_not(
@@ -187,10 +193,10 @@ def test_who_heeds_the_evaluations_may_end_a_run_which_then_goes_on_as_if_it_had
         raise LookupError("enough")
 
     with pytest.raises(LookupError, match="enough"):
-        loop.start(small(), dataclasses.replace(QUIET, run_dir=run_dir), heed)
+        training.train(small(), dataclasses.replace(QUIET, run_dir=run_dir), heed)
     assert heard == [(QUIET.checkpoint_every, 1)]
     assert not (run_dir / "evaluation.json").exists()
-    loop.go_on(
+    training.train(
         small(), dataclasses.replace(QUIET, resume=run_dir), heed
     )  # what was evaluated before is not heard of again
     assert len(heard) == 1

@@ -6,7 +6,7 @@ import signal
 
 import pytest
 
-from dgae_jax.run.signals import Signals, Stopped
+from dgae_jax.run.runtime import Signals, Stopped
 
 
 def test_a_signal_in_the_middle_of_an_import_leaves_it_whole_and_stops_the_work_at_its_next_word(

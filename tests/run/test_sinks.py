@@ -10,24 +10,23 @@ import numpy as np
 import pytest
 
 from dgae_jax.configs.config import ConfigError
-from dgae_jax.run import loop, manifest, metrics
-from dgae_jax.run.options import SINKS, RunOptions, validate_options
-from dgae_jax.run.sinks import feed
-from dgae_jax.run.sinks.sink import Sink
+from dgae_jax.run import directory, loggers, metrics, training
+from dgae_jax.run.loggers import MetricLogger
+from dgae_jax.run.options import METRIC_LOGGERS, RunOptions, validate_options
 from tests.runs import QUIET, SMALL, last, small, stopped_half_way, timeless
 
 SEEDS = 2
 
 
 def present(name):
-    return importlib.util.find_spec(SINKS[name]) is not None
+    return importlib.util.find_spec(METRIC_LOGGERS[name]) is not None
 
 
 def needs(name):
-    return pytest.mark.skipif(not present(name), reason=f"{SINKS[name]} is not installed")
+    return pytest.mark.skipif(not present(name), reason=f"{METRIC_LOGGERS[name]} is not installed")
 
 
-READABLE = [pytest.param(name, marks=needs(name)) for name in SINKS]
+READABLE = [pytest.param(name, marks=needs(name)) for name in METRIC_LOGGERS]
 
 
 @pytest.fixture(autouse=True)
@@ -155,20 +154,24 @@ def check(name, run_dir, seed, but=()):
 def plain(tmp_path_factory):
     """A run of two seeds that feeds nobody."""
     run_dir = tmp_path_factory.mktemp("runs") / "plain"
-    assert loop.train(small(seeds=SEEDS), dataclasses.replace(QUIET, run_dir=run_dir)) == 0
+    assert (
+        training.train_command(small(seeds=SEEDS), dataclasses.replace(QUIET, run_dir=run_dir)) == 0
+    )
     return run_dir
 
 
 @pytest.fixture(scope="module")
 def fed(tmp_path_factory):
     """The same run, which feeds all that are installed."""
-    run_dir, names = tmp_path_factory.mktemp("runs") / "fed", tuple(filter(present, SINKS))
+    run_dir, names = tmp_path_factory.mktemp("runs") / "fed", tuple(filter(present, METRIC_LOGGERS))
     with pytest.MonkeyPatch.context() as patch:
         for name in ("WANDB_MODE", "WANDB_API_KEY", "MLFLOW_TRACKING_URI"):
             patch.delenv(name, raising=False)
         patch.setenv("NETRC", str(run_dir.parent / "none"))
         assert (
-            loop.train(small(seeds=SEEDS), dataclasses.replace(QUIET, run_dir=run_dir, log=names))
+            training.train_command(
+                small(seeds=SEEDS), dataclasses.replace(QUIET, run_dir=run_dir, log=names)
+            )
             == 0
         )
     return run_dir
@@ -191,10 +194,12 @@ def test_who_is_fed_changes_no_bit(plain, fed):
 def test_a_resumed_run_has_each_step_once_in_its_viewers(name, fed, tmp_path):
     run_dir, config = tmp_path / "half", small(seeds=SEEDS)
     stopped_half_way(fed, run_dir)
-    assert manifest.options(run_dir).log == tuple(filter(present, SINKS))
-    assert loop.resume(config, dataclasses.replace(QUIET, resume=run_dir, log=(name,))) == 0
+    assert directory.saved_options(run_dir).log == tuple(filter(present, METRIC_LOGGERS))
+    assert (
+        training.train_command(config, dataclasses.replace(QUIET, resume=run_dir, log=(name,))) == 0
+    )
     there_already = (
-        () if feed.KINDS[name].goes_back else ("seconds",)
+        () if loggers.KINDS[name].goes_back else ("seconds",)
     )  # else equal, of the iterations after the checkpoint
     for seed in range(SEEDS):
         check(name, run_dir, seed, but=there_already)
@@ -204,7 +209,9 @@ def test_a_resumed_run_has_each_step_once_in_its_viewers(name, fed, tmp_path):
 def test_a_viewer_that_is_asked_for_later_gets_what_came_before(name, plain, tmp_path):
     run_dir, config = tmp_path / "half", small(seeds=SEEDS)
     stopped_half_way(plain, run_dir)
-    assert loop.resume(config, dataclasses.replace(QUIET, resume=run_dir, log=(name,))) == 0
+    assert (
+        training.train_command(config, dataclasses.replace(QUIET, resume=run_dir, log=(name,))) == 0
+    )
     for seed in range(SEEDS):
         check(name, run_dir, seed)
 
@@ -261,7 +268,7 @@ def failing(calls, at):
 
         if at == "begin":
             taken("begin")()
-        return Sink(taken("rows"), taken("evaluations"), taken("close"))
+        return MetricLogger(taken("rows"), taken("evaluations"), taken("close"))
 
     return begin
 
@@ -271,9 +278,11 @@ def test_a_sink_that_fails_costs_one_warning_and_the_run_ends_as_it_would(
     at, plain, tmp_path, capsys, monkeypatch
 ):
     run_dir, calls = tmp_path / "run", []
-    monkeypatch.setitem(feed.KINDS, "tensorboard", feed.Kind(failing(calls, at), goes_back=True))
+    monkeypatch.setitem(
+        loggers.KINDS, "tensorboard", loggers.Kind(failing(calls, at), goes_back=True)
+    )
     assert (
-        loop.train(
+        training.train_command(
             small(seeds=SEEDS), dataclasses.replace(QUIET, run_dir=run_dir, log=("tensorboard",))
         )
         == 0
@@ -294,15 +303,22 @@ def test_a_viewer_that_failed_gets_what_it_lacks_when_the_run_is_resumed(
 ):
     run_dir, config = tmp_path / "run", small(seeds=SEEDS)
     with monkeypatch.context() as patch:
-        patch.setitem(feed.KINDS, "tensorboard", feed.Kind(failing([], "rows"), goes_back=True))
+        patch.setitem(
+            loggers.KINDS, "tensorboard", loggers.Kind(failing([], "rows"), goes_back=True)
+        )
         assert (
-            loop.train(config, dataclasses.replace(QUIET, run_dir=run_dir, log=("tensorboard",)))
+            training.train_command(
+                config, dataclasses.replace(QUIET, run_dir=run_dir, log=("tensorboard",))
+            )
             == 0
         )
     assert not (run_dir / "tensorboard").exists()
     longer = dataclasses.replace(config, total_steps=10 * SMALL.samples_per_iteration)
     assert (
-        loop.resume(longer, dataclasses.replace(QUIET, resume=run_dir, log=("tensorboard",))) == 0
+        training.train_command(
+            longer, dataclasses.replace(QUIET, resume=run_dir, log=("tensorboard",))
+        )
+        == 0
     )
     check("tensorboard", run_dir, 0)
 
@@ -321,7 +337,7 @@ def test_how_far_a_viewer_has_come_may_be_any_file_and_then_says_nothing(data, t
     (tmp_path / "sinks.json").write_text(data)
     assert all(
         noted == {"ids": {}, "rows": 0, "evaluations": 0}
-        for noted in feed._read(tmp_path / "sinks.json").values()
+        for noted in loggers._read(tmp_path / "sinks.json").values()
     )
 
 
@@ -337,12 +353,12 @@ def test_a_viewer_that_is_unknown_or_named_twice_is_refused(log, message):
         validate_options(RunOptions(log=log), SMALL)
 
 
-@pytest.mark.parametrize("name", SINKS)
+@pytest.mark.parametrize("name", METRIC_LOGGERS)
 def test_a_missing_library_is_refused_with_what_to_install(name, monkeypatch):
     monkeypatch.setattr(importlib.util, "find_spec", lambda _: None)
     with pytest.raises(
         ConfigError,
-        match=rf'log {name}: {SINKS[name]} is missing; pip install "dgae_jax\[{name}\]"',
+        match=rf'log {name}: {METRIC_LOGGERS[name]} is missing; pip install "dgae_jax\[{name}\]"',
     ):
         validate_options(RunOptions(log=(name,)), SMALL)
 
@@ -350,14 +366,14 @@ def test_a_missing_library_is_refused_with_what_to_install(name, monkeypatch):
 def test_a_folder_of_its_name_is_not_a_library(tmp_path, monkeypatch):
     (tmp_path / "a_viewer_s_folder").mkdir()
     monkeypatch.syspath_prepend(tmp_path)
-    monkeypatch.setitem(SINKS, "wandb", "a_viewer_s_folder")
+    monkeypatch.setitem(METRIC_LOGGERS, "wandb", "a_viewer_s_folder")
     with pytest.raises(ConfigError, match="a_viewer_s_folder is missing"):
         validate_options(RunOptions(log=("wandb",)), SMALL)
 
 
 def test_a_run_goes_on_with_its_viewers_and_a_list_is_as_good_as_a_tuple(run_dir):
-    manifest.add(run_dir, RunOptions(log=["tensorboard"]))
-    assert manifest.options(run_dir) == RunOptions(log=("tensorboard",))
+    directory.extend_manifest(run_dir, RunOptions(log=["tensorboard"]))
+    assert directory.saved_options(run_dir) == RunOptions(log=("tensorboard",))
     text = (run_dir / "manifest.json").read_text()
     (run_dir / "manifest.json").write_text(text.replace('"tensorboard"', '{"no": "viewer"}'))
-    assert manifest.options(run_dir).log == ()
+    assert directory.saved_options(run_dir).log == ()

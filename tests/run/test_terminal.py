@@ -11,7 +11,7 @@ import threading
 import pytest
 
 from dgae_jax.run import terminal
-from dgae_jax.run.progress import Reporter
+from dgae_jax.run.terminal import Reporter
 from tests.helpers import ROOT, TINY
 
 

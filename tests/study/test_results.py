@@ -6,8 +6,8 @@ import os
 
 import pytest
 
-from dgae_jax.run import restore
-from dgae_jax.run.restore import Trained
+from dgae_jax.run import checkpoint
+from dgae_jax.run.checkpoint import Networks
 from dgae_jax.study import results, view
 from dgae_jax.study.matrix import Cell, Study
 from tests.runs import small
@@ -52,9 +52,9 @@ def study(tmp_path):
 def test_a_cell_that_is_trained_again_has_a_new_policy_and_one_that_was_not_keeps_its_file(
     study, monkeypatch
 ):
-    monkeypatch.setattr(restore, "trained", lambda *_: Trained(None, None, study.path))
-    monkeypatch.setattr(restore, "reward_std", lambda *_: None)
-    monkeypatch.setattr(restore, "save_networks", lambda path, *_: path.write_text("new"))
+    monkeypatch.setattr(checkpoint, "load_networks", lambda *_: Networks(None, None, study.path))
+    monkeypatch.setattr(checkpoint, "reward_std", lambda *_: None)
+    monkeypatch.setattr(checkpoint, "save_networks", lambda path, *_: path.write_text("new"))
     run_dir, policy = study.run_dir(study.cells[0]), study.path / "policy.msgpack"
     (run_dir / "evaluation.json").write_text("{}")
     for age, content in ((-1, "new"), (1, "old")):

@@ -18,9 +18,9 @@ from optuna.trial import TrialState, create_trial
 from dgae_jax.cli.train import parsed
 from dgae_jax.configs.config import ConfigError
 from dgae_jax.configs.presets import preset
-from dgae_jax.run import directory, files, loop, machine
+from dgae_jax.run import directory, files, runtime, training
 from dgae_jax.run.options import RunOptions
-from dgae_jax.run.signals import Signals
+from dgae_jax.run.runtime import Signals
 from dgae_jax.study import outcome, side_by_side, tune, worker
 from dgae_jax.study.search import space_of
 from dgae_jax.study.storage import distributions, open_storage, open_study, requeue
@@ -293,7 +293,7 @@ def test_trials_side_by_side_are_worth_what_they_are_alone(tmp_path):
     with Signals() as signals:
         values = side_by_side.train(ours, study, trials, signals)
     alone = [
-        loop.start(
+        training.train(
             ours.config_of(trial.params),
             dataclasses.replace(OPTIONS, run_dir=tmp_path / str(trial.number)),
         )
@@ -373,7 +373,7 @@ def test_values_that_do_not_fit_the_machine_count_as_a_trial_without_a_return(
 ):
     ours = tuning(tmp_path / "study", "policy.hidden=4000x4000,4096x4096", trials=1)
     _, study = opened(ours)
-    monkeypatch.setattr(machine, "memory", lambda: 2**26)
+    monkeypatch.setattr(runtime, "available_memory", lambda: 2**26)
     assert worker.serve(ours, 0) == 0
     assert [(trial.state, trial.value) for trial in finished(study)] == [(TrialState.PRUNED, None)]
 

@@ -14,20 +14,18 @@ from dgae_jax.configs.resolved import ResolvedConfig
 from dgae_jax.learn.build import InferenceState
 from dgae_jax.learn.types import TrainState
 from dgae_jax.physics.engine import PhysicsState
-from dgae_jax.run import checkpoint, hosts, notebook
-from dgae_jax.run.compiling import Watch
+from dgae_jax.run import checkpoint, metrics, runtime, terminal
 from dgae_jax.run.evaluation import evaluate_policies
-from dgae_jax.run.evaluations import EvaluationsFile
-from dgae_jax.run.metrics import MetricsFile
+from dgae_jax.run.loggers import Feed
+from dgae_jax.run.metrics import EvaluationsFile, MetricsFile
 from dgae_jax.run.options import RunOptions
-from dgae_jax.run.signals import Stopped
-from dgae_jax.run.sinks.feed import Feed
+from dgae_jax.run.runtime import Stopped, Watch
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
-class Record:
+class RunLogger:
     """The growing files of one run directory, begun anew or continued behind the iterations `done`.
 
     Checkpoints and plots are written beside the training, one after the other; a failure is raised by the call after.
@@ -39,14 +37,14 @@ class Record:
         self.metrics = MetricsFile(run_dir / "metrics.jsonl", config, done)
         self.evaluations = EvaluationsFile(run_dir / "evaluations.jsonl")
         self.evaluations.cut(done * config.samples_per_iteration, config.num_seeds)
-        self.feed = Feed(options.log if hosts.is_first() else (), run_dir, config, self.steps)
-        self.page = notebook.Page(self.figure) if notebook.is_there() else None
+        self.feed = Feed(options.log if runtime.is_first() else (), run_dir, config, self.steps)
+        self.page = terminal.Page(self.figure) if terminal.in_notebook() else None
         """Where the learning curve is shown as it grows."""
         self.began = time.monotonic() - self.metrics.seconds
         self.beside, self.pending = ThreadPoolExecutor(1), Future()
         self.pending.set_result(None)
 
-    def __enter__(self) -> "Record":
+    def __enter__(self) -> "RunLogger":
         return self
 
     def __exit__(self, kind: Any, *_) -> None:
@@ -117,7 +115,7 @@ class Record:
     def figure(self) -> "Figure | None":
         """The learning curve so far, None before the first return."""
         data = self._curve()
-        return None if np.isnan(data[1]).all() else _curve_module().learning_curve(*data)
+        return None if np.isnan(data[1]).all() else metrics.learning_curve(*data)
 
     def _curve(self) -> tuple[np.ndarray, np.ndarray, str, np.ndarray]:
         title = f"{self.config.task}, {self.config.algo}, {self.config.physics}"
@@ -127,7 +125,7 @@ class Record:
         """Of every world that has turned non-finite the last state and action from which it did, per run: arrays by name."""
         for seed in sorted(seeds):
             episodes = jax.tree.map(
-                lambda x, i=seed - self.config.seed: x[i], hosts.whole(state.episodes)
+                lambda x, i=seed - self.config.seed: x[i], runtime.gather(state.episodes)
             )
             worlds = np.flatnonzero(episodes.nonfinite)
             world, action = jax.tree.map(lambda x, at=worlds: x[at], episodes.incident)
@@ -149,14 +147,6 @@ class Record:
             )
 
 
-def _curve_module() -> Any:
-    """Matplotlib takes a second to load, which training does not wait for."""
-    from dgae_jax.run import curve
-
-    return curve
-
-
 def _plot(path: Path, *data) -> None:
-    curve = _curve_module()
-    curve.save(curve.learning_curve(*data), path)
+    metrics.save_figure(metrics.learning_curve(*data), path)
     gc.collect()  # a figure is full of cycles, and left alone figures gather: 3 MB each

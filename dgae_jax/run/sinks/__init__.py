@@ -1,1 +1,0 @@
-"""Viewers of other people that a run feeds while it trains: TensorBoard, Weights & Biases, MLflow."""
