@@ -15,7 +15,7 @@ from dgae_jax.cli.source import check_directory, check_index
 from dgae_jax.configs.config import ConfigError, invalid
 from dgae_jax.configs.resolved import ResolvedConfig
 from dgae_jax.envs.registry import spec_of
-from dgae_jax.export import graph
+from dgae_jax.export import onnx_model
 from dgae_jax.run import directory, files, terminal
 from dgae_jax.run.options import RunOptions
 
@@ -64,7 +64,7 @@ def _checked(arguments: Arguments) -> tuple[ResolvedConfig, Path]:
     if not arguments.to:
         raise invalid("to", "nothing", "one or more of npz, onnx, gymnasium")
     if "onnx" in arguments.to:
-        graph.check_extra()
+        onnx_model.check_installed()
     config = directory.config_of(arguments.run_dir)
     check_index(arguments.index, config, arguments.run_dir)
     if "gymnasium" in arguments.to and spec_of(config.env).referee() is None:

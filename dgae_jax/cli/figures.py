@@ -5,7 +5,6 @@ Flags are checked before the rest is imported: JAX and MuJoCo take seconds to lo
 
 import sys
 from dataclasses import dataclass
-from importlib import import_module
 from pathlib import Path
 from typing import Literal, NamedTuple
 
@@ -24,7 +23,7 @@ EXAMPLES = (
 
 
 class Drawing(NamedTuple):
-    """A figure: a module of the room `export` with a function `figure`."""
+    """A figure: a function of `export.figures`."""
 
     kinds: tuple[str, ...]
     """Endings of the files that it becomes."""
@@ -65,14 +64,14 @@ def main() -> int:
 
 
 def _draw(chosen: dict[str, Drawing], out: Path) -> None:
-    from dgae_jax.export import pictures
+    from dgae_jax.export import figures
 
     try:
         out.mkdir(parents=True, exist_ok=True)
         for name, drawing in chosen.items():
-            figure = import_module(f"dgae_jax.export.{name}").figure()
+            figure = getattr(figures, name)()
             for kind in drawing.kinds:
-                pictures.save(figure, out / f"{name}.{kind}")
+                figures.save(figure, out / f"{name}.{kind}")
                 terminal.say(f"written to {out / name}.{kind}")
     except OSError as reason:
         raise invalid(

@@ -15,7 +15,7 @@ from dgae_jax.cli.source import check_file, check_index
 from dgae_jax.configs.config import ConfigError, invalid
 from dgae_jax.configs.resolved import ResolvedConfig
 from dgae_jax.envs.registry import TASKS, spec_of
-from dgae_jax.export import gl, video
+from dgae_jax.export import encoding, gl
 from dgae_jax.run import directory, files, terminal
 from dgae_jax.run.options import RunOptions
 
@@ -57,8 +57,8 @@ class Arguments:
     fps: int = 25
     """Frames per second of the MP4; a GIF has at most half of the default [1/s]."""
     out: Path | None = None
-    """File to write, to whose name .mp4 and .gif are added; by default film in the run directory, film-best, film-during or
-    film-compare [path]."""
+    """File to write, to whose name .mp4 and .gif are added; by default video in the run directory, video-best,
+    video-during or video-compare [path]."""
     cache_dir: str = RunOptions.cache_dir
     """Where compiled programs are kept between runs; none disables [path]."""
 
@@ -82,9 +82,10 @@ def main() -> int:
     try:
         arguments = parse(Arguments, PURPOSE, examples=EXAMPLES)
         _check(arguments)
-        configs = [
-            _config(path, arguments.index) for path in (arguments.run_dir, *arguments.compare)
-        ]
+        sources = (arguments.run_dir, *arguments.compare)
+        if any(path.is_file() for path in sources):
+            gl.choose()  # to read the configuration in a policy's file imports MuJoCo
+        configs = [_config(path, arguments.index) for path in sources]
         _check_out(arguments)
         gl.choose()
         return _render(arguments, configs)
@@ -112,13 +113,12 @@ def _check(arguments: Arguments) -> None:
             )
     if arguments.during and arguments.run_dir.is_file():
         raise ConfigError(f"--during: must be left out with {arguments.run_dir}, a single policy")
-    if "mp4" in video.FORMATS[arguments.format]:
-        video.check_extra()
+    encoding.check_installed()
 
 
 def _check_out(arguments: Arguments) -> None:
     stem = _stem(arguments)
-    for kind in video.FORMATS[arguments.format]:
+    for kind in encoding.FORMATS[arguments.format]:
         check_file(stem.with_name(f"{stem.name}.{kind}"))
 
 
@@ -142,7 +142,8 @@ def _stem(arguments: Arguments) -> Path:
             "best": arguments.checkpoint == "best",
         }
         return files.beside(
-            arguments.run_dir, "-".join(["film", *(kind for kind, is_so in kinds.items() if is_so)])
+            arguments.run_dir,
+            "-".join(["video", *(kind for kind, is_so in kinds.items() if is_so)]),
         )
     out = arguments.out
     return out.with_suffix("") if out.suffix in (".mp4", ".gif") else out
@@ -155,24 +156,26 @@ def _titles(paths: list[Path]) -> list[str]:
 
 
 def _render(arguments: Arguments, configs: list[ResolvedConfig]) -> int:
-    from dgae_jax.export import episodes, film
+    from dgae_jax.export import video
     from dgae_jax.run import runtime
     from dgae_jax.run.terminal import Reporter
 
     runtime.use_devices(configs[0], RunOptions(devices=1, num_processes=1))
     runtime.use_cache(arguments.cache_dir)
-    shots = episodes.Shots(arguments.episodes, arguments.seed, arguments.seconds)
+    clip = video.Clip(arguments.episodes, arguments.seed, arguments.seconds)
     paths = [arguments.run_dir, *arguments.compare]
     if arguments.during:
-        scenes = episodes.of_checkpoints(arguments.run_dir, configs[0], arguments.index, shots)
+        scenes = video.of_checkpoints(arguments.run_dir, configs[0], arguments.index, clip)
     else:
         runs = list(zip(_titles(paths), paths, configs, strict=True))
-        scenes = episodes.of_runs(runs, arguments.checkpoint or "latest", arguments.index, shots)
-    stem, size = _stem(arguments), film.Size(arguments.width, arguments.height)
+        scenes = video.of_runs(runs, arguments.checkpoint or "latest", arguments.index, clip)
+    stem, size = _stem(arguments), video.Size(arguments.width, arguments.height)
     with Reporter() as reporter:
-        frames = film.film(scenes, size, arguments.fps, reporter.watch)
+        frames = video.frames(scenes, size, arguments.fps, reporter.watch)
         try:
-            written = video.write(frames, stem, video.FORMATS[arguments.format], arguments.fps)
+            written = encoding.write(
+                frames, stem, encoding.FORMATS[arguments.format], arguments.fps
+            )
         except OSError as reason:
             raise invalid(
                 "out", stem, f"a file that can be written ({reason.strerror})"

@@ -1,1 +1,1 @@
-"""A trained policy leaves the house: files for programs without JAX, pictures and films of it."""
+"""Policies for programs without JAX, videos and figures, envs for other trainers."""

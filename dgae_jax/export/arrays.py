@@ -1,10 +1,14 @@
-"""A trained policy and its critic as plain arrays by name, all that is needed to act: what every exported file is made of.
+"""A trained policy and its critic as plain arrays by name: the content of every exported file.
 
-`policy_weight_I` [inputs, outputs] and `policy_bias_I` are the layers from the first to the last, likewise the critic's; tanh stands
-between layers. Where there is `critic_steps` [K - 1, K], the critic's first output is the mean of its quantiles, to which
-log(1 + exp(the others)) @ `critic_steps` is added; where there is `critic_count` [1], its quantiles are its K outputs, sorted.
-Observations are normalised before: (obs - `observation_mean`) / `observation_std`, clipped to ± `observation_limit`. Actions are
-clipped to `action_low` … `action_high`. `env` is Gymnasium's name of the task, `episode_length` its time limit.
+- `policy_weight_I` [inputs, outputs], `policy_bias_I`: layers, first to last, tanh between them.
+  `critic_weight_I` and `critic_bias_I` likewise.
+- `critic_steps` [K - 1, K] of an ordered critic: its first output is the mean of its quantiles, to
+  which softplus(the others) @ `critic_steps` is added.
+- `critic_count` [1] of a sorted critic: its quantiles are its K outputs, sorted.
+- Observations are normalized first: (obs - `observation_mean`) / `observation_std`, clipped to
+  ± `observation_limit`.
+- Actions are clipped to `action_low` … `action_high`.
+- `env` is Gymnasium's id of the task, `episode_length` its time limit.
 """
 
 import io
@@ -15,7 +19,7 @@ import numpy as np
 
 from dgae_jax.configs.config import ConfigError
 from dgae_jax.configs.resolved import ResolvedConfig
-from dgae_jax.export.outside import policy as outside
+from dgae_jax.export.templates.policy import Policy as NumpyPolicy
 from dgae_jax.learn.build import make_task
 from dgae_jax.learn.normalizers import OBSERVATION_LIMIT
 from dgae_jax.maths.transport import GAP_BIAS, centered_cumsum
@@ -27,13 +31,19 @@ from dgae_jax.run.options import eval_env_id
 Arrays = dict[str, np.ndarray]
 
 TOLERANCE = 1e-4
-"""Largest difference between the arrays' outputs and those of the policy itself, absolute and relative."""
+"""Largest difference, absolute and relative, between outputs of the arrays and of the policy."""
 
 
 def arrays_of(found: Networks, config: ResolvedConfig, index: int) -> Arrays:
-    """The arrays of one of the seeds trained side by side.
+    """Return the arrays of one seed's policy.
 
-    Raises ConfigError if they do not do what the policy does, because a part of its networks is of another make.
+    Args:
+        found: the networks of all seeds that were trained together.
+        config: of the run.
+        index: which of the seeds, from 0.
+
+    Raises:
+        ConfigError: the arrays do not compute what the policy does, as its networks are custom.
     """
     policy, critic = jax.tree.map(lambda x: x[index], (found.policy, found.critic))
     env = make_task(config)
@@ -41,13 +51,13 @@ def arrays_of(found: Networks, config: ResolvedConfig, index: int) -> Arrays:
     try:
         layers = {**_layers("policy", policy.params), **_layers("critic", critic.params)}
         if config.critic.kind == "ordered":
-            layers |= _in_order(layers)
+            layers |= _ordered(layers)
         elif config.critic.kind == "sorted":
             layers["critic_count"] = np.array([config.critic.outputs])
     except KeyError as name:
-        raise _foreign(found, f"{name} is missing") from name
+        raise _custom(found, f"{name} is missing") from name
     arrays = {
-        **_normaliser(policy.obs_stats, int(env.observation_size)),  # pyright: ignore[reportArgumentType]
+        **_normalizer(policy.obs_stats, int(env.observation_size)),  # pyright: ignore[reportArgumentType]
         **layers,
         "action_low": np.asarray(low, np.float32),
         "action_high": np.asarray(high, np.float32),
@@ -58,61 +68,56 @@ def arrays_of(found: Networks, config: ResolvedConfig, index: int) -> Arrays:
     return arrays
 
 
-def packed(arrays: Arrays) -> bytes:
-    """The arrays as the bytes of a file `.npz`."""
+def to_npz(arrays: Arrays) -> bytes:
+    """Return the bytes of an `.npz` file."""
     file = io.BytesIO()
     np.savez(file, **arrays)  # pyright: ignore[reportArgumentType]
     return file.getvalue()
 
 
-def _normaliser(statistics: Any, size: int) -> Arrays:
-    """Without statistics, one that changes nothing."""
-    values = (np.zeros(size), np.ones(size), np.inf)
+def _normalizer(statistics: Any, size: int) -> Arrays:
+    mean, std, limit = np.zeros(size), np.ones(size), np.inf
     if statistics is not None:
-        values = (statistics.mean, statistics.std, OBSERVATION_LIMIT)
-    names = ("observation_mean", "observation_std", "observation_limit")
-    return {name: np.asarray(value, np.float32) for name, value in zip(names, values, strict=True)}
+        mean, std, limit = statistics.mean, statistics.std, OBSERVATION_LIMIT
+    values = {"observation_mean": mean, "observation_std": std, "observation_limit": limit}
+    return {name: np.asarray(value, np.float32) for name, value in values.items()}
 
 
 def _layers(network: str, params: Any) -> Arrays:
-    """Of the modules in `learn.networks`: the layers of the torso, then the head, which is the policy's mean."""
+    """Return the torso's layers and the head of a module of `learn.networks`."""
     torso, head = (params["params"].get(name, {}) for name in ("Torso_0", "Dense_0"))
-    layers = [*(torso[f"Dense_{i}"] for i in range(len(torso))), head]
-    parts = {"weight": "kernel", "bias": "bias"}
-    return {
-        f"{network}_{ours}_{i}": np.asarray(layer[name])
-        for i, layer in enumerate(layers)
-        for ours, name in parts.items()
-    }
+    arrays = {}
+    for i, layer in enumerate([*(torso[f"Dense_{i}"] for i in range(len(torso))), head]):
+        arrays[f"{network}_weight_{i}"] = np.asarray(layer["kernel"])
+        arrays[f"{network}_bias_{i}"] = np.asarray(layer["bias"])
+    return arrays
 
 
-def _in_order(layers: Arrays) -> Arrays:
-    """What makes the critic's outputs quantiles in order (`maths.transport.monotone_quantiles`): its last bias, and the matrix of the steps."""
+def _ordered(layers: Arrays) -> Arrays:
+    """Return the last bias and the matrix that make outputs quantiles (`monotone_quantiles`)."""
     last = [name for name in layers if name.startswith("critic_bias_")][-1]
-    narrow = layers[last] - np.float32(GAP_BIAS) * (np.arange(layers[last].size) > 0)
+    bias = layers[last] - np.float32(GAP_BIAS) * (np.arange(layers[last].size) > 0)
     return {
-        last: narrow.astype(np.float32),
-        "critic_steps": np.asarray(centered_cumsum(narrow.size), np.float32),
+        last: bias.astype(np.float32),
+        "critic_steps": np.asarray(centered_cumsum(bias.size), np.float32),
     }
 
 
 def _compare(arrays: Arrays, policy: Policy, found: Networks) -> None:
-    ours = outside.Policy(io.BytesIO(packed(arrays)))
-    spread = np.random.default_rng(0).normal(size=(100, policy.observation_size))
-    obs = arrays["observation_mean"] + 3 * spread * arrays["observation_std"]
+    exported = NumpyPolicy(io.BytesIO(to_npz(arrays)))
+    noise = np.random.default_rng(0).normal(size=(100, policy.observation_size))
+    obs = arrays["observation_mean"] + 3 * noise * arrays["observation_std"]
     try:
         outputs = {
-            "actions": (ours(obs), policy(obs)),
-            "quantiles": (ours.quantiles(obs), policy.quantiles(obs)),
+            "actions": (exported(obs), policy(obs)),
+            "quantiles": (exported.quantiles(obs), policy.quantiles(obs)),
         }
     except ValueError as reason:
-        raise _foreign(found, "as plain layers they do not fit together") from reason
+        raise _custom(found, "their shapes do not fit plain layers") from reason
     for name, (a, b) in outputs.items():
         if a.shape != b.shape or not np.allclose(a, b, rtol=TOLERANCE, atol=TOLERANCE):
-            raise _foreign(found, f"as plain layers their {name} differ")
+            raise _custom(found, f"plain layers give other {name}")
 
 
-def _foreign(found: Networks, why: str) -> ConfigError:
-    return ConfigError(
-        f"{found.path}: must have networks of dgae_jax's own make to be exported; {why}"
-    )
+def _custom(found: Networks, why: str) -> ConfigError:
+    return ConfigError(f"{found.path}: only networks of dgae_jax can be exported; {why}")

@@ -1,88 +1,159 @@
-"""What leaves the house, one directory per format: the policy, programs that act by it, and its card."""
+"""Exported policies: one directory per format, each with a model card."""
 
-import inspect
-from collections.abc import Callable, Sequence
+import re
+from collections.abc import Sequence
+from dataclasses import asdict
 from importlib import resources
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import jinja2
+
 from dgae_jax.configs.resolved import ResolvedConfig
-from dgae_jax.export import graph
-from dgae_jax.export.arrays import Arrays, arrays_of, packed
-from dgae_jax.export.card import card
-from dgae_jax.export.facts import Facts, facts_of
-from dgae_jax.export.outside.policy import Policy
-from dgae_jax.run import checkpoint, files
+from dgae_jax.export import onnx_model
+from dgae_jax.export.arrays import Arrays, arrays_of, to_npz
+from dgae_jax.run import checkpoint, directory, files
+from dgae_jax.run.metrics import EvaluationsFile
+from dgae_jax.run.options import engines_of, eval_env_id
+from dgae_jax.run.terminal import counted
 
-IMPORT = "from dgae_jax.export.outside.policy import Policy\n"
-"""The line of the agent's source in whose place the class itself is put."""
-
-
-class Exported(NamedTuple):
-    """One policy, ready to be written in any format."""
-
-    arrays: Arrays
-    config: ResolvedConfig
-    facts: Facts
+TEMPLATES = resources.files("dgae_jax.export") / "templates"
 
 
-def _npz(policy: Exported) -> dict[str, bytes]:
-    return {"policy.npz": packed(policy.arrays), "policy.py": _source("policy.py").encode()}
+class Metadata(NamedTuple):
+    """The facts about a policy in its run's files; None where they have none."""
 
-
-def _onnx(policy: Exported) -> dict[str, bytes]:
-    facts, config = policy.facts, policy.config
-    about = {
-        "task": str(policy.arrays["env"]),
-        "algorithm": str(config.algo),
-        "samples": facts.samples,
-        "git_revision": facts.git_revision,
-    }
-    return {
-        "policy.onnx": graph.model(
-            policy.arrays, {name: str(value) for name, value in about.items() if value is not None}
-        )
-    }
-
-
-def _gymnasium(policy: Exported) -> dict[str, bytes]:
-    before, after = _source("agent.py").split(IMPORT)
-    return {
-        "policy.npz": packed(policy.arrays),
-        "agent.py": f"{before}\n{inspect.getsource(Policy)}{after}".encode(),
-    }
-
-
-def _source(name: str) -> str:
-    return (resources.files("dgae_jax.export") / "outside" / name).read_text(encoding="utf-8")
-
-
-FILES: dict[str, Callable[[Exported], dict[str, bytes]]] = {
-    "npz": _npz,
-    "onnx": _onnx,
-    "gymnasium": _gymnasium,
-}
-"""The files of each format."""
+    checkpoint: str
+    """Name of the file with the networks."""
+    samples: int | None
+    returns: str | None
+    """Mean and standard deviation of its evaluation."""
+    versions: str
+    """Of the libraries that trained it."""
+    git_revision: str | None
 
 
 def export(
     source: Path, config: ResolvedConfig, which: str, index: int, formats: Sequence[str], out: Path
 ) -> dict[str, list[str]]:
-    """Write the directories `out`/FORMAT and name the files in each; nothing is written before all is made.
+    """Write the directories `out`/FORMAT; nothing is written before everything is made.
 
-    `source` is a run directory or a policy's file, `index` that among the seeds trained side by side. Raises as
-    `restore.trained` and `arrays_of`, OSError where a file cannot be written.
+    Args:
+        source: a run directory, or the file of a policy.
+        config: of the run.
+        which: the checkpoint, latest or best.
+        index: which of the seeds that were trained together, from 0.
+        formats: any of npz, onnx, gymnasium.
+        out: the directory to write in.
+
+    Returns:
+        The names of the files by format.
+
+    Raises:
+        ConfigError: as `checkpoint.load_networks` and `arrays_of`.
+        OSError: a file cannot be written.
     """
     found = checkpoint.load_networks(source, config, which)
-    policy = Exported(
-        arrays_of(found, config, index), config, facts_of(source, found.path, config, index)
-    )
-    made: dict[str, dict[str, Any]] = {}
-    for kind in formats:
-        text = card(kind, policy.arrays, config, index, policy.facts, which)
-        made[kind] = {**FILES[kind](policy), "README.md": text.encode()}
-    for kind, contents in made.items():
+    arrays = arrays_of(found, config, index)
+    metadata = metadata_of(source, found.path, config, index)
+    bundles = {
+        kind: _files(kind, arrays, config, metadata)
+        | {"README.md": card(kind, arrays, config, index, metadata, which).encode()}
+        for kind in formats
+    }
+    for kind, contents in bundles.items():
         (out / kind).mkdir(parents=True, exist_ok=True)
         for name, data in contents.items():
             files.replace(out / kind / name, data)
-    return {kind: list(contents) for kind, contents in made.items()}
+    return {kind: list(contents) for kind, contents in bundles.items()}
+
+
+def _files(
+    kind: str, arrays: Arrays, config: ResolvedConfig, metadata: Metadata
+) -> dict[str, bytes]:
+    if kind == "onnx":
+        facts = {
+            "task": arrays["env"],
+            "algorithm": config.algo,
+            "samples": metadata.samples,
+            "git_revision": metadata.git_revision,
+        }
+        known = {name: str(value) for name, value in facts.items() if value is not None}
+        return {"policy.onnx": onnx_model.serialize(arrays, known)}
+    programs = ("policy.py", "agent.py") if kind == "gymnasium" else ("policy.py",)
+    copies = {name: (TEMPLATES / name).read_bytes() for name in programs}
+    return {"policy.npz": to_npz(arrays), **copies}
+
+
+def card(
+    kind: str, arrays: Arrays, config: ResolvedConfig, index: int, metadata: Metadata, which: str
+) -> str:
+    """Return the model card: what the policy is, how well it does, how the files are used."""
+    source = (TEMPLATES / "card.md").read_text(encoding="utf-8")
+    jinja = jinja2.Environment(trim_blocks=True, undefined=jinja2.StrictUndefined)
+    noise = {where: std for where, std in asdict(config.noise).items() if std}
+    return jinja.from_string(source).render(
+        metadata._asdict(),
+        format=kind,
+        task=eval_env_id(config),
+        algo=config.algo,
+        trained_on=f"{config.task}, engine {config.physics}, seed {config.seed + index}",
+        noise=", ".join(f"{where} {std:g}" for where, std in noise.items()),
+        engine=engines_of(config)[0],
+        best=which == "best",
+        critic=config.critic.kind,
+        gamma=f"{config.gamma:g}",
+        scaled=config.normalize_rewards,
+        episode_length=int(arrays["episode_length"]),
+        observations=arrays["observation_mean"].size,
+        actions=arrays["action_low"].size,
+        quantiles=config.critic.outputs,
+    )
+
+
+def metadata_of(source: Path, found: Path, config: ResolvedConfig, index: int) -> Metadata:
+    """Read the metadata of a policy.
+
+    Args:
+        source: a run directory, or the file of a policy.
+        found: the file with the networks.
+        config: of the run.
+        index: which of the seeds that were trained together, from 0.
+    """
+    seed = config.seed + index
+    if source.is_file():
+        row = _sweep_row(source, seed)
+        samples, evaluation = row.get("steps"), row.get("final")
+    else:
+        row, samples = directory.last_part(source), int(found.stem.removeprefix("steps_"))
+        rows = EvaluationsFile(source / "evaluations.jsonl").rows
+        here = [each for each in rows if (each["steps"], each["seed"]) == (samples, seed)]
+        evaluation = here[-1] if here else None
+    versions, revision = row.get("versions"), str(row.get("git_revision"))
+    known = versions.items() if isinstance(versions, dict) else ()
+    return Metadata(
+        checkpoint=found.name,
+        samples=samples if type(samples) is int else None,
+        returns=_returns(evaluation),
+        versions=", ".join(f"{name} {version}" for name, version in known if version is not None),
+        git_revision=revision if re.fullmatch(r"[0-9a-f]{7,64}\+?", revision) else None,
+    )
+
+
+def _sweep_row(policy: Path, seed: int) -> dict[str, Any]:
+    """Return the row of the sweep's `results.jsonl` that names this policy file, or nothing."""
+    policy = policy.resolve()
+    results, name = policy.parent.parent / "results.jsonl", f"{policy.parent.name}/{policy.name}"
+    rows = [row for row, _ in files.whole_rows(results)] if results.is_file() else []
+    matching = [row for row in rows if (row.get("policy"), row.get("seed")) == (name, seed)]
+    return matching[-1] if matching else {}
+
+
+def _returns(evaluation: Any) -> str | None:
+    """Describe an evaluation; None for anything else, as a file may hold anything."""
+    try:
+        mean, std = evaluation["return_mean"], evaluation["return_std"]
+        episodes = counted(len(evaluation["returns"]), "episode")
+        return f"{mean:,.1f} ± {std:,.1f} over {episodes}"
+    except (TypeError, KeyError, ValueError):
+        return None

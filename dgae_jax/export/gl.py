@@ -1,9 +1,10 @@
-"""Which OpenGL MuJoCo draws with where there is no screen.
+"""Choice of the OpenGL backend with which MuJoCo draws without a screen.
 
-MuJoCo decides when it is imported and cannot decide again in the same process. So each candidate is tried in a process of its own,
-and MUJOCO_GL is set before MuJoCo is imported here. Nothing in this module imports it.
+MuJoCo reads MUJOCO_GL when it is imported and never again. So each candidate is tried in a process
+of its own before MuJoCo is imported here; this module does not import it.
 """
 
+import functools
 import os
 import subprocess
 import sys
@@ -13,49 +14,47 @@ from dgae_jax.configs.config import ConfigError
 VARIABLE = "MUJOCO_GL"
 
 CANDIDATES = ("cgl",) if sys.platform == "darwin" else ("egl", "osmesa")
-"""In this order: EGL draws on a GPU if there is one, OSMesa always on the CPU."""
+"""In order of preference: EGL uses a GPU if there is one, OSMesa always the CPU."""
 
 _TRIAL = (
     "import mujoco; mujoco.Renderer(mujoco.MjModel.from_xml_string('<mujoco/>'), 16, 16).render()"
 )
 
-_PATIENCE = 60
-"""Seconds after which a candidate that hangs counts as broken."""
+_TIMEOUT = 60
+"""Seconds after which a candidate counts as broken."""
 
 
 def choose() -> str:
-    """The backend that draws here, also in MUJOCO_GL for this process; one that the user put there is tried and never replaced.
+    """Set MUJOCO_GL to a backend that works; call this before MuJoCo is imported.
 
-    To be called before MuJoCo is imported. Raises ConfigError if none draws.
+    Returns:
+        The backend. One that the user has set is tried, and never replaced.
+
+    Raises:
+        ConfigError: no backend works.
     """
-    given = os.environ.get(VARIABLE)
-    if given:
-        if not draws(given):
-            allowed = f"{', '.join(CANDIDATES)} or another that draws a picture here, or left out"
-            raise ConfigError(f"{VARIABLE}={given}: must be {allowed}")
-        return given
-    for backend in CANDIDATES:
-        if draws(backend):
+    chosen = os.environ.get(VARIABLE)
+    for backend in [chosen] if chosen else CANDIDATES:
+        if works(backend):
             os.environ[VARIABLE] = backend
             return backend
-    tried = " nor ".join(CANDIDATES)
+    if chosen:
+        raise ConfigError(
+            f"{VARIABLE}={chosen}: cannot draw here; unset it, or try {', '.join(CANDIDATES)}"
+        )
     raise ConfigError(
-        f"{VARIABLE}: neither {tried} draws a picture here; on Debian: apt install libegl1 libgl1-mesa-dri, or libosmesa6"
+        f"{VARIABLE}: cannot draw with {' or '.join(CANDIDATES)}; "
+        "on Debian: apt install libegl1 libgl1-mesa-dri, or libosmesa6"
     )
 
 
-def draws(backend: str) -> bool:
-    """Whether a process with this backend can draw a picture."""
+@functools.cache
+def works(backend: str) -> bool:
+    """Return whether MuJoCo can draw with this backend."""
+    environment = {**os.environ, VARIABLE: backend}
+    command = [sys.executable, "-c", _TRIAL]
     try:
-        environment = {**os.environ, VARIABLE: backend}
-        return (
-            subprocess.run(
-                [sys.executable, "-c", _TRIAL],
-                env=environment,
-                capture_output=True,
-                timeout=_PATIENCE,
-            ).returncode
-            == 0
-        )
+        done = subprocess.run(command, env=environment, capture_output=True, timeout=_TIMEOUT)
     except subprocess.TimeoutExpired:
         return False
+    return done.returncode == 0

@@ -366,7 +366,7 @@ KINDS = {
 ITERATIONS = 256
 """Most iterations that are read at once."""
 
-PICTURES = ("curve.png", "film.mp4", "film.gif")
+PICTURES = ("curve.png", "video.mp4", "video.gif")
 """Files of the run directory that sinks get at the end."""
 
 

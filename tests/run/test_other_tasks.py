@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import subprocess
 import sys
 from importlib.util import find_spec
 
@@ -128,13 +129,11 @@ def test_a_policy_learnt_in_gymnasium_is_exported_and_plays_there_the_same(
         ["export", str(tmp_path / "run"), "--to", "gymnasium", "--out", str(tmp_path / "out")],
     )
     assert command("export")() == 0
-    from dgae_jax.export.outside import agent, policy
-
-    ours = policy.Policy(tmp_path / "out" / "gymnasium" / "policy.npz")
-    number = int(np.random.SeedSequence((0, 0)).generate_state(1, np.uint64)[0])
-    world = agent.make_world(ours)
-    assert agent.play(world, ours, number) == pytest.approx(run.evaluation["returns"][0], rel=1e-4)
-    world.close()
+    agent = [sys.executable, "agent.py", "--episodes", "1"]
+    directory = tmp_path / "out" / "gymnasium"
+    done = subprocess.run(agent, cwd=directory, capture_output=True, text=True, check=True)
+    played = float(done.stdout.split()[3])
+    assert played == pytest.approx(run.evaluation["returns"][0], rel=1e-4)
 
 
 @pytest.mark.slow

@@ -1,4 +1,4 @@
-"""A task's robot as a picture, drawn by MuJoCo from positions and velocities."""
+"""Pictures of a task's robot, drawn by MuJoCo."""
 
 from typing import NamedTuple
 
@@ -12,14 +12,14 @@ from dgae_jax.envs.task import load_spec
 
 
 class Camera(NamedTuple):
-    """Where the robot is seen from. It follows the centre of mass of the robot in x and y, its height stays."""
+    """A view that follows the robot's center of mass in x and y, at constant height."""
 
     distance: float
-    """From what it looks at [m]."""
+    """From the point it looks at [m]."""
     elevation: float
-    """Of the line of sight, negative from above [degrees]."""
+    """Negative from above [degrees]."""
     azimuth: float
-    """Of the line of sight, 90 along y [degrees]."""
+    """90 looks along y [degrees]."""
     height: float
     """Of the point it looks at [m]."""
 
@@ -32,35 +32,33 @@ CAMERAS = {
 }
 
 SKY = ((1.0, 1.0, 1.0), (0.80, 0.88, 0.95))
-"""Colours of the sky; that of the models is dark, and is lost in print."""
+"""The models' own sky is dark, which is lost in print."""
 
 GROUND = ((0.86, 0.89, 0.90), (0.74, 0.79, 0.82))
-"""Colours of the squares of the ground."""
 
 LAMP, AMBIENT, HEADLIGHT = (0.4, 0.4, 0.4), (0.45, 0.45, 0.45), (0.3, 0.3, 0.3)
-"""Light from above, from all around and from where one looks; together about 1, so that the ground keeps its colours."""
+"""Together about 1, so that the ground keeps its colors."""
 
 LAMP_HEIGHT = 4.0
-"""Of the light from above [m]; it must be above the robot."""
+"""Above the robot [m]."""
 
-SHADOW = 2048
-"""Resolution of shadows [pixels]; finer ones take most of the time where the CPU draws."""
+SHADOW_SIZE = 2048
+"""Resolution of shadows [pixels]; on a CPU finer ones take most of the time."""
 
 
-class Stage:
-    """A renderer of one task; to be closed, or used as a context."""
+class Renderer:
+    """Draw one task; close it, or use it as a context manager."""
 
     def __init__(self, env: str, version: str | None, *, width: int, height: int):
-        """`width` and `height` of the pictures in pixels. Raises ValueError for a task that has no model file."""
-        self._camera = mujoco.MjvCamera()
-        settings = CAMERAS[env]
-        self._camera.distance, self._camera.elevation, self._camera.azimuth = settings[:3]
-        self._height = settings.height
+        """Open an OpenGL context for pictures of this size in pixels."""
+        view = CAMERAS[env]
+        self._camera, self._height = mujoco.MjvCamera(), view.height
+        self._camera.distance, self._camera.elevation, self._camera.azimuth = view[:3]
         self.model = _model(env, version, width, height)
         self._data = mujoco.MjData(self.model)
         self._renderer = mujoco.Renderer(self.model, height, width)
 
-    def __enter__(self) -> "Stage":
+    def __enter__(self) -> "Renderer":
         return self
 
     def __exit__(self, *_) -> None:
@@ -70,26 +68,22 @@ class Stage:
         """Free the OpenGL context."""
         self._renderer.close()
 
-    def picture(
+    def render(
         self, qpos: Float[np.ndarray, " Q"], qvel: Float[np.ndarray, " V"] | None = None
     ) -> UInt8[np.ndarray, "H W 3"]:
-        """The robot at these positions (m, rad) and velocities, by default at rest."""
+        """Draw the robot at these positions (m, rad) and velocities, by default at rest."""
         self._data.qpos[:] = qpos
         self._data.qvel[:] = 0 if qvel is None else qvel
         mujoco.mj_forward(self.model, self._data)
         x, y, _ = self._data.body("torso").subtree_com
         self._camera.lookat[:] = x, y, self._height
-        self._data.light_xpos[:] = (
-            x,
-            y,
-            LAMP_HEIGHT,
-        )  # a lamp that stays behind casts no shadow here
+        self._data.light_xpos[:] = x, y, LAMP_HEIGHT  # a lamp that stays behind casts no shadow
         self._renderer.update_scene(self._data, self._camera)
         return self._renderer.render().copy()
 
 
 def _model(env: str, version: str | None, width: int, height: int) -> mujoco.MjModel:
-    """The model that Gymnasium plays, in colours for print."""
+    """Load Gymnasium's model, in colors for print."""
     name, _, version = str(spec_of(env).referee(version)).partition("-")
     spec = load_spec(getattr(gym_tasks, name).FILE[version])
     for texture in spec.textures:
@@ -106,5 +100,5 @@ def _model(env: str, version: str | None, width: int, height: int) -> mujoco.MjM
     model.vis.headlight.ambient, model.vis.headlight.diffuse = AMBIENT, HEADLIGHT
     model.vis.headlight.specular = (0, 0, 0)
     model.vis.global_.offwidth, model.vis.global_.offheight = width, height
-    model.vis.quality.shadowsize = SHADOW
+    model.vis.quality.shadowsize = SHADOW_SIZE
     return model
