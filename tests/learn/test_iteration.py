@@ -1,4 +1,5 @@
-import dataclasses
+"""Whole iterations: determinism, learning of known values, what updates are handed, failures."""
+
 from functools import cache
 
 import chex
@@ -9,316 +10,248 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 import dgae_jax as dg
-from dgae_jax.learn import iteration
-from dgae_jax.learn.build import make_greedy, make_trainer, policies_of, seed_keys
+from dgae_jax.configs.algorithms import ALGORITHMS
+from dgae_jax.learn.build import make_greedy, make_task, make_trainer, policies_of, seed_keys
 from dgae_jax.learn.types import TrainableState, Update
-from tests.helpers import SMALL, distance, small
+from tests.helpers import distance, small
+from tests.parity import WARP
 from tests.probes import Coin, Constant, Counter, Delayed, Fragile, Target
 
 
 @cache
-def hopper(algo):
-    config = small(algo)
-    env = dg.make_env("hopper", physics="native")
-    return config, make_trainer(env, 4)
+def hopper():
+    return make_trainer(dg.make_env("hopper", physics="native"), 4)
 
 
-def fresh(trainer, config):
+def init(trainer, config):
     return trainer.init(config, seed_keys(config))
 
 
 def assert_same_bits(a, b):
-    chex.assert_trees_all_equal(
-        *(
-            jax.tree.map(
-                lambda x: jax.random.key_data(x) if x.dtype == seed_keys(SMALL).dtype else x, t
-            )
-            for t in (a, b)
-        )
-    )
+    def plain(x):
+        return jax.random.key_data(x) if jnp.issubdtype(x.dtype, jax.dtypes.prng_key) else x
+
+    chex.assert_trees_all_equal(*(jax.tree.map(plain, tree) for tree in (a, b)))
 
 
-@pytest.mark.parametrize("algo", ["ppo", "dppo"])
-def test_same_key_same_bits_whatever_the_number_of_iterations_per_dispatch(algo):
-    config, trainer = hopper(algo)
-    together, rows = trainer.dispatch(config, fresh(trainer, config), 3)
-    apart = fresh(trainer, config)
+def test_results_do_not_depend_on_iterations_per_dispatch():
+    config, trainer = dg.resolve(small("dppo")), hopper()
+    together, rows = trainer.dispatch(config, init(trainer, config), 3)
+    one_by_one = init(trainer, config)
     for i in range(3):
-        apart, row = trainer.dispatch(config, apart, 1)
-        chex.assert_trees_all_equal(
-            jax.tree.map(lambda x, i=i: x[i], rows), jax.tree.map(lambda x: x[0], row)
-        )
-    assert_same_bits(together, apart)
+        one_by_one, row = trainer.dispatch(config, one_by_one, 1)
+        for name in rows:
+            assert_array_equal(rows[name][i], row[name][0])
+    assert_same_bits(together, one_by_one)
     assert int(together.iteration[0]) == 3
 
 
 def test_a_run_is_two_programs_whatever_the_count_and_the_floats():
-    config, trainer = small("ppo"), make_trainer(Counter(), 4)
-    state = fresh(trainer, config)
+    trainer = make_trainer(Counter(), 4)
+    state = init(trainer, dg.resolve(small("ppo")))
     for count, gamma, rate in ((1, 0.99, 3e-4), (4, 0.9, 1e-3), (2, 0.5, 1e-2)):
-        policy = dataclasses.replace(config.policy, learning_rate=rate)
-        state, _ = trainer.dispatch(
-            dataclasses.replace(config, gamma=gamma, policy=policy), state, count
-        )
+        config = small("ppo").replace(**{"gamma": gamma, "policy.learning_rate": rate})
+        state, _ = trainer.dispatch(dg.resolve(config), state, count)
     assert int(state.iteration[0]) == 7
     assert (trainer.init._cache_size(), trainer.dispatch._cache_size()) == (1, 1)
 
 
-def test_floats_of_the_configuration_may_be_swept_in_one_program():
-    env = Target()
-    rates = jnp.array([1e-4, 1e-2])
-
-    @jax.jit
-    @jax.vmap
-    def moved(rate):
-        config = small("ppo")
-        config = dataclasses.replace(
-            config, policy=dataclasses.replace(config.policy, learning_rate=rate)
-        )
-        init, step = dg.make_train(dg.make_algorithm("ppo", env, config), env, config)
-        state = init(jax.random.key(0))
-        after, _ = step(state)
-        return sum(
-            jnp.abs(a - b).sum()
-            for a, b in zip(
-                jax.tree.leaves(after.policy.params),
-                jax.tree.leaves(state.policy.params),
-                strict=True,
-            )
-        )
-
-    slow, fast = moved(rates)
-    assert 10 * slow < fast
+def test_a_seed_among_others_is_the_single_run_up_to_rounding():
+    # bit for bit at the start; then a batched matrix product may round differently
+    trainer = hopper()
+    three, single = (dg.resolve(small("dppo", num_seeds=n, seed=s)) for n, s in ((3, 5), (1, 6)))
+    ours, theirs = init(trainer, three), init(trainer, single)
+    assert_same_bits(jax.tree.map(lambda x: x[1:2], ours), theirs)
+    ours, _ = trainer.dispatch(three, ours, 2)
+    theirs, _ = trainer.dispatch(single, theirs, 2)
+    second = jax.tree.map(lambda x: x[1:2], ours.policy.params)
+    chex.assert_trees_all_close(second, theirs.policy.params, atol=1e-5)
 
 
-def test_a_seed_trained_beside_others_is_the_run_alone_up_to_rounding():
-    # bit for bit at the start; then a batched matrix product may round differently from a single one
-    config, trainer = hopper("ppo")
-    three, alone = (
-        dataclasses.replace(config, num_seeds=3, seed=5),
-        dataclasses.replace(config, seed=6),
-    )
-    beside, single = fresh(trainer, three), fresh(trainer, alone)
-    assert_same_bits(jax.tree.map(lambda x: x[1:2], beside), single)
-    beside, _ = trainer.dispatch(three, beside, 2)
-    single, _ = trainer.dispatch(alone, single, 2)
-    for ours, theirs in zip(
-        jax.tree.leaves(beside.policy.params), jax.tree.leaves(single.policy.params), strict=True
-    ):
-        assert_allclose(ours[1], theirs[0], atol=1e-5)
-
-
-ALL = ["ppo", "dppo", "trpo", "dtrpo", "a2c", "da2c"]
+# ---- learning of known values ----
 
 
 def learn(env, algo, iterations, **changes):
-    fit = {
-        "hidden": (16,),
-        "epochs": 4,
-        "minibatches": 4,
-        "learning_rate": 3e-3,
-        "learning_rate_end": 1.0,
-    }
-    policy = {**fit, "epochs": 1, "minibatches": 1, "learning_rate": 3e-2} if "a2c" in algo else fit
-    policy = {"hidden": (16,)} if "trpo" in algo else policy
+    """The configuration, the state after so many iterations, and the metrics."""
+    fit = {"epochs": 4, "minibatches": 4, "learning_rate": 3e-3, "learning_rate_end": 1.0}
+    policy = {
+        "clip": fit,
+        "gradient": {**fit, "epochs": 1, "minibatches": 1, "learning_rate": 3e-2},
+        "trust-region": {},
+    }[ALGORITHMS[algo].policy_update]
     quantiles = {"quantiles": 8} if algo.startswith("d") else {}
-    critic = dg.CriticConfig(**fit, **quantiles, **changes.pop("critic", {}))
     config = dg.Config(
         algo=algo,
         num_envs=32,
         num_steps=8,
         total_steps=256 * iterations,
-        policy=dg.PolicyConfig(**policy),
-        critic=critic,
-        **changes,
+        policy=dg.PolicyConfig(hidden=(16,), **policy),
+        critic=dg.CriticConfig(hidden=(16,), **fit, **quantiles),
     )
+    config = dg.resolve(config.replace(**changes))
     trainer = make_trainer(env, iterations)
-    state, rows = trainer.dispatch(config, trainer.init(config, seed_keys(config)), iterations)
+    state, rows = trainer.dispatch(config, init(trainer, config), iterations)
     return config, jax.tree.map(lambda x: x[0], state), rows
 
 
-@pytest.mark.parametrize("algo", ALL)
+UNSCALED = {"normalize_rewards": False, "normalize_observations": False}
+OTHERS = [pytest.param(name, marks=pytest.mark.slow) for name in ("ppo", "dtrpo", "a2c")]
+
+
+@pytest.mark.parametrize("algo", ["dppo", "trpo", "da2c", *OTHERS])
 def test_the_policy_finds_the_best_action_for_each_observation(algo):
-    env = Target()
-    config, state, rows = learn(env, algo, 40)
-    greedy = make_greedy(env, config)
-    state = policies_of(state)
-    assert_allclose(greedy(state, jnp.array([[-1.0], [1.0]])), [[-0.5], [0.5]], atol=0.1)
+    config, state, rows = learn(Target(), algo, 40)
+    greedy = make_greedy(Target(), config)
+    actions = greedy(policies_of(state), jnp.array([[-1.0], [1.0]]))
+    assert_allclose(actions, [[-0.5], [0.5]], atol=0.1)
     for name, column in rows.items():
         assert column.shape == (40, 1)
         assert np.isfinite(column).all(), name
 
 
 @pytest.mark.parametrize(
-    ("algo", "target"),
-    [
-        ("ppo", "lambda-return"),
-        ("dppo", "lambda-return"),
-        ("dppo", "sr-lambda"),
-        ("dppo", "lambda-shift"),
-        ("dppo", "bellman"),
-        ("dppo", "monte-carlo"),
-    ],
+    ("algo", "target"), [("ppo", "lambda-return"), ("dppo", "sr-lambda"), ("dppo", "bellman")]
 )
 def test_the_critic_finds_the_value_of_a_constant_reward(algo, target):
     # V = 1 / (1 - ½) = 2, also across time limits, which do not end the bootstrap
-    off = {"normalize_rewards": False, "normalize_observations": False}
-    _, _, rows = learn(
-        Constant(), algo, 60, gamma=0.5, episode_length=5, critic={"target": target}, **off
-    )
+    changes = {"gamma": 0.5, "episode_length": 5, "critic.target": target, **UNSCALED}
+    _, _, rows = learn(Constant(), algo, 60, **changes)
     assert_allclose(rows["critic/value"][-1, 0], 2.0, atol=0.05)
-
-
-def test_monte_carlo_is_sr_lambda_with_a_lambda_of_1_for_the_critic_alone():
-    def first(target, lam):
-        _, state, _ = learn(Delayed(), "dppo", 1, lam=lam, critic={"target": target})
-        return jax.tree.map(np.asarray, (state.critic.params, state.policy.params))
-
-    critic, policy = first("monte-carlo", 0.5)
-    same, _ = first("sr-lambda", 1.0)
-    another, same_policy = first("sr-lambda", 0.5)
-    jax.tree.map(np.testing.assert_array_equal, critic, same)
-    jax.tree.map(np.testing.assert_array_equal, policy, same_policy)
-    assert not all(
-        np.array_equal(x, y)
-        for x, y in zip(jax.tree.leaves(critic), jax.tree.leaves(another), strict=True)
-    )
 
 
 @pytest.mark.parametrize("algo", ["ppo", "da2c"])
 def test_the_critic_finds_values_that_are_paid_later(algo):
-    off = {"normalize_rewards": False, "normalize_observations": False}
-    env = Delayed()
-    config, state, _ = learn(env, algo, 80, gamma=0.5, **off)
-    critic = dg.make_algorithm(algo, env, config).critic
+    config, state, _ = learn(Delayed(), algo, 80, gamma=0.5, **UNSCALED)
+    critic = dg.make_algorithm(algo, Delayed(), config).critic
     assert_allclose(critic.predict(state.critic.params, jnp.eye(3)).mean(-1), [2, 4, 8], atol=0.3)
 
 
-def test_a_distributional_critic_finds_the_distribution_of_a_noisy_reward():
-    off = {"normalize_rewards": False, "normalize_observations": False}
-    env = Coin()
-    config, state, rows = learn(env, "dtrpo", 80, critic={"kappa": 0.05}, diagnostics=True, **off)
-    quantiles = dg.make_algorithm("dtrpo", env, config).critic.predict(
-        state.critic.params, jnp.ones(1)
-    )
+def test_a_quantile_critic_finds_the_distribution_of_a_noisy_reward():
+    changes = {"critic.kappa": 0.05, "diagnostics": True, **UNSCALED}
+    config, state, rows = learn(Coin(), "dtrpo", 80, **changes)
+    critic = dg.make_algorithm("dtrpo", Coin(), config).critic
+    quantiles = critic.predict(state.critic.params, jnp.ones(1))
     assert_allclose(jnp.sort(quantiles), [-1] * 4 + [1] * 4, atol=0.35)
-    assert_allclose(
-        rows["critic/wasserstein"][-1, 0], 1.0, atol=0.25
-    )  # half of its mass is 2 away from either outcome
+    # half of its mass is 2 away from either outcome
+    assert_allclose(rows["critic/wasserstein"][-1, 0], 1.0, atol=0.25)
     assert rows["critic/similar_means"].shape == (80, 1)
 
 
-def test_a_world_that_turns_non_finite_is_counted_and_reaches_neither_normaliser_nor_critic_nor_policy():
-    _, state, rows = learn(
-        Fragile(jnp.nan, "pipeline_state", "reward", "obs"), "dppo", 4, episode_length=6
-    )
+def test_monte_carlo_is_sr_lambda_with_lambda_1_for_the_critic_alone():
+    def after_one(target, gae_lambda):
+        changes = {"gae_lambda": gae_lambda, "critic.target": target}
+        _, state, _ = learn(Delayed(), "dppo", 1, **changes)
+        return state.critic.params, state.policy.params
+
+    critic, policy = after_one("monte-carlo", 0.5)
+    chex.assert_trees_all_equal(critic, after_one("sr-lambda", 1.0)[0])
+    other_critic, same_policy = after_one("sr-lambda", 0.5)
+    chex.assert_trees_all_equal(policy, same_policy)
+    assert distance(critic, other_critic) > 0
+
+
+def test_a_non_finite_env_reaches_no_statistic_and_no_network():
+    env = Fragile(jnp.nan, "pipeline_state", "reward", "obs")
+    _, state, rows = learn(env, "dppo", 4, episode_length=6)
     assert (rows["nonfinite"][:, 0] > 0).all()
-    for part in (state.policy, state.critic, state.observations, state.reward_scale):
-        assert all(np.isfinite(x).all() for x in jax.tree.leaves(part))
+    kept = state.policy, state.critic, state.obs_stats, state.reward_scale
+    assert all(np.isfinite(x).all() for x in jax.tree.leaves(kept))
     for name, column in rows.items():
         assert np.isfinite(column).all(), name
 
 
-# ---- one iteration with a part of our own, which shows what the updates are handed ----
+# ---- single iterations with a part of our own, which shows what the updates are handed ----
 
 
-def iterate(env, iterations=1, *, observations=True, **parts):
-    """States and metrics of a few iterations of PPO with some of its parts replaced; none of its networks moves by itself."""
-    stay = Update(lambda params: (), lambda key, fit, batch: (fit, {"loss": jnp.zeros(())}))
-    config = small("ppo")
-    algorithm = dg.make_algorithm("ppo", env, config)._replace(
-        **{"policy_update": stay, "critic_update": stay, **parts}
+def stay(params):
+    return ()
+
+
+def report(**measures):
+    """An update that changes nothing and reports measures of the batch."""
+
+    def step(key, state, batch):
+        measured = {name: measure(batch) for name, measure in measures.items()}
+        return state, {"loss": jnp.zeros(()), **measured}
+
+    return Update(stay, step)
+
+
+def iterate(env, iterations=1, *, config=None, **parts):
+    """States and metrics of PPO with some of its parts replaced; no network moves by itself."""
+    config = (config or small("ppo")).replace(
+        num_envs=8, num_steps=3, gamma=0.9, gae_lambda=0.9, normalize_rewards=False
     )
-    init, step = iteration.make_train(
-        algorithm, env, num_envs=8, num_steps=3, episode_length=100, gamma=0.9, lam=0.9,
-        normalize_observations=observations, normalize_rewards=False,
-    )  # fmt: skip
-    states, rows, step = [init(jax.random.key(0))], [], jax.jit(step)
+    parts = {"policy_update": report(), "critic_update": report()} | parts
+    algorithm = dg.make_algorithm("ppo", env, config)._replace(**parts)
+    start, step = dg.make_train(algorithm, env, config)
+    states, rows, step = [start(jax.random.key(0))], [], jax.jit(step)
     for _ in range(iterations):
         state, row = step(states[-1])
         states, rows = [*states, state], [*rows, row]
     return states, rows
 
 
-def report(**measures):
-    """An update that changes nothing and reports measures of the batch."""
-
-    def step(key, fit, batch):
-        return fit, {
-            "loss": jnp.zeros(()),
-            **{name: measure(batch) for name, measure in measures.items()},
-        }
-
-    return Update(lambda params: (), step)
-
-
-def test_advantages_are_standardised_over_the_valid_steps_alone():
+def test_advantages_are_standardized_over_unmasked_steps():
     seen = report(
-        valid=lambda b: b.valid.sum(),
-        mean=lambda b: b.advantage.mean(where=b.valid),
-        std=lambda b: b.advantage.std(where=b.valid),
-        others=lambda b: jnp.abs(jnp.where(b.valid, 0, b.advantage)).max(),
+        count=lambda b: b.mask.sum(),
+        mean=lambda b: b.advantage.mean(where=b.mask),
+        std=lambda b: b.advantage.std(where=b.mask),
+        others=lambda b: jnp.abs(jnp.where(b.mask, 0, b.advantage)).max(),
     )
     _, (row,) = iterate(Fragile(jnp.nan, "reward"), policy_update=seen)
-    assert 0 < 3 * 8 - row["policy/valid"] == row["nonfinite"] < 8
-    assert_allclose(
-        [row["policy/mean"], row["policy/std"], row["policy/others"]], [0, 1, 0], atol=1e-5
-    )
+    assert 0 < 3 * 8 - row["policy/count"] == row["nonfinite"] < 8
+    got = [row[f"policy/{name}"] for name in ("mean", "std", "others")]
+    assert_allclose(got, [0, 1, 0], atol=1e-5)
 
 
-def test_the_ratio_is_one_before_the_first_step_because_statistics_are_frozen_across_rollout_and_update():
-    # one epoch of one minibatch looks at the batch once, at the policy that acted
-    once = small("ppo")
-    once = dataclasses.replace(
-        once, policy=dataclasses.replace(once.policy, epochs=1, minibatches=1)
-    )
-    states, rows = iterate(
-        Counter(), 3, policy_update=dg.make_algorithm("ppo", Counter(), once).policy_update
-    )
+def test_statistics_are_frozen_across_rollout_and_update():
+    # one epoch of one minibatch looks at the batch once, with the policy that acted: ρ = 1
+    once = small("ppo").replace(**{"policy.epochs": 1, "policy.minibatches": 1})
+    update = dg.make_algorithm("ppo", Counter(), once).policy_update
+    states, rows = iterate(Counter(), 3, policy_update=update)
     assert_allclose([row["policy/kl"] for row in rows], 0, atol=1e-6)
     assert_array_equal([row["policy/clip_fraction"] for row in rows], 0)
     assert distance(states[-1].policy.params, states[0].policy.params) > 1e-4
-    assert distance(states[-1].observations, states[0].observations) > 1
+    assert distance(states[-1].obs_stats, states[0].obs_stats) > 1
 
 
-def test_observations_that_are_not_normalised_are_not_clipped_either():
+def test_observations_that_are_not_normalized_are_not_clipped_either():
     seen = report(largest=lambda b: b.obs.max(), next=lambda b: b.next_obs.max())
-    states, rows = iterate(Counter(), 5, observations=False, policy_update=seen)
-    assert states[-1].observations is None
+    raw = small("ppo").replace(normalize_observations=False)
+    states, rows = iterate(Counter(), 5, config=raw, policy_update=seen)
+    assert states[-1].obs_stats is None
     assert [float(row["policy/largest"]) for row in rows] == [2, 5, 8, 11, 14]
     assert rows[-1]["policy/next"] == 15
 
 
 @pytest.mark.parametrize(("broken", "healthy"), [("policy", "critic"), ("critic", "policy")])
-@pytest.mark.parametrize("what", ["parameters", "optimiser", "loss"])
-def test_an_update_that_is_not_finite_is_left_out_and_the_other_is_not(broken, healthy, what):
-    def spoil(key, fit, batch):
-        params = jax.tree.map(lambda x: x + jnp.where(what == "parameters", jnp.nan, 1), fit.params)
-        moments = jnp.where(what == "optimiser", jnp.inf, 1.0)
+@pytest.mark.parametrize("what", ["parameters", "optimizer", "loss"])
+def test_a_non_finite_update_is_skipped_and_the_other_is_not(broken, healthy, what):
+    def spoil(key, state, batch):
+        step = jnp.where(what == "parameters", jnp.nan, 1)
+        params = jax.tree.map(lambda x: x + step, state.params)
+        moments = jnp.where(what == "optimizer", jnp.inf, 1.0)
         return TrainableState(params, moments), {"loss": jnp.where(what == "loss", jnp.nan, 0.0)}
 
-    def move(key, fit, batch):
-        return TrainableState(jax.tree.map(lambda x: x + 1, fit.params), fit.opt_state), {
-            "loss": jnp.zeros(())
-        }
+    def move(key, state, batch):
+        params = jax.tree.map(lambda x: x + 1, state.params)
+        return TrainableState(params, state.opt_state), {"loss": jnp.zeros(())}
 
-    start = jnp.zeros(())
     updates = {
-        f"{broken}_update": Update(lambda params: start, spoil),
-        f"{healthy}_update": Update(lambda params: (), move),
+        f"{broken}_update": Update(lambda params: jnp.zeros(()), spoil),
+        f"{healthy}_update": Update(stay, move),
     }
     (before, *_, after), rows = iterate(Counter(), 2, **updates)
     chex.assert_trees_all_equal(getattr(after, broken), getattr(before, broken))
-    chex.assert_trees_all_close(
-        getattr(after, healthy).params,
-        jax.tree.map(lambda x: x + 2, getattr(before, healthy).params),
-    )
+    want = jax.tree.map(lambda x: x + 2, getattr(before, healthy).params)
+    chex.assert_trees_all_close(getattr(after, healthy).params, want)
     assert [row["skipped"] for row in rows] == [1, 1]
     assert after.failures == 2
 
 
 class Breaking(Counter):
-    """Its reward is not a number in the given step of every episode."""
+    """Its reward is NaN at the given step of every episode."""
 
     def __init__(self, at):
         super().__init__()
@@ -332,14 +265,37 @@ class Breaking(Counter):
 @pytest.mark.parametrize(
     ("at", "failures"),
     [
-        (1, [1, 2, 3, 4]),  # every step is invalid
-        (2, [0, 1, 0, 1]),  # of three steps one is invalid, then two, then one, …
+        (1, [1, 2, 3, 4]),  # every step is masked
+        (2, [0, 1, 0, 1]),  # of three steps one, then two, then one, …
         (3, [0, 0, 0, 0]),  # one of three
     ],
 )
-def test_an_iteration_in_which_more_than_half_of_the_steps_are_invalid_counts_as_a_failure(
-    at, failures
-):
+def test_an_iteration_with_most_steps_masked_counts_as_a_failure(at, failures):
     states, rows = iterate(Breaking(at), 4)
     assert [int(state.failures) for state in states[1:]] == failures
     assert all(row["skipped"] == 0 for row in rows)
+
+
+# ---- engines ----
+
+
+@cache
+def returns(physics):
+    """Mean return of each of ten iterations of DPPO on Hopper."""
+    config = dg.Config(physics=physics, num_envs=16, num_steps=128, total_steps=10 * 16 * 128)
+    config = dg.resolve(config)
+    trainer = make_trainer(make_task(config), 10)
+    _, rows = trainer.dispatch(config, init(trainer, config), 10)
+    return np.asarray(rows["episode_return"])[:, 0]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("physics", ["native", "mjx", pytest.param("mjx-warp", marks=WARP)])
+def test_ten_iterations_on_hopper_have_similar_returns_on_every_engine(physics):
+    # The first iteration differs by the engines' rounding, which updates and contacts multiply.
+    # How fast the policy learns stays alike: jax and native differ by 12 % over the last five.
+    ours, theirs = returns("jax"), returns(physics)
+    assert_allclose(theirs[0], ours[0], rtol=1e-3)
+    assert_allclose(theirs[1], ours[1], rtol=0.05)
+    assert_allclose(theirs[5:].mean(), ours[5:].mean(), rtol=0.35)
+    assert theirs[-1] > 4 * theirs[0]

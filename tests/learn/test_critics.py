@@ -1,0 +1,247 @@
+"""Critics: their losses and targets, where each target leads, and their calibration.
+
+The fixed points are those of a process whose return distribution is known. From `FIRST` a fair coin
+pays ±1 and leads to `SECOND`, where another pays ±1 and leads to the end. With γ = ½ the return
+from `FIRST` is ±1 ± ½, each with probability ¼, and from `SECOND` ±1.
+"""
+
+import jax
+import jax.numpy as jnp
+import optax
+import pytest
+from numpy.testing import assert_allclose, assert_array_equal
+
+import dgae_jax as dg
+from dgae_jax.learn.critics import CRITICS, TARGETS, ordered_critic, quantile_critic, sorted_critic
+from dgae_jax.learn.diagnostics import critic_diagnostics
+from dgae_jax.maths.returns import decay
+from dgae_jax.maths.transport import quantile_midpoints
+from tests.helpers import distance
+from tests.learn.batches import make_batch
+
+FIRST, SECOND, END = jnp.eye(3)
+TRUE = {"first": [-1.5, -0.5, 0.5, 1.5], "second": [-1, -1, 1, 1]}
+
+
+def make_critic(kind, target, hidden=(8,), quantiles=4, kappa=1.0):
+    options = {} if kind == "scalar" else {"quantiles": quantiles, "kappa": kappa}
+    return CRITICS[kind](3, hidden=hidden, target=TARGETS[target], **options)
+
+
+def episodes(end):
+    """The four equally likely episodes, 64 times each; three steps, the last in an idle state."""
+    coins = jnp.tile(jnp.array([[-1.0, -1], [-1, 1], [1, -1], [1, 1]]), (64, 1))
+    count = len(coins)
+    reward = jnp.stack([coins[:, 0], coins[:, 1], jnp.zeros(count)])
+    obs = jnp.broadcast_to(jnp.stack([FIRST, SECOND, END])[:, None], (3, count, 3))
+    next_obs = jnp.broadcast_to(jnp.stack([SECOND, END, END])[:, None], (3, count, 3))
+    terminated = jnp.broadcast_to(jnp.array([False, end == "terminal", False])[:, None], (3, count))
+    return obs, reward, terminated, next_obs
+
+
+def fixed_point(kind, target, lam, end="terminal", steps=1500):
+    """Quantiles of a table (a linear network on one-hot observations) after a long fit."""
+    critic = make_critic(kind, target, hidden=(), kappa=1e-2)
+    obs, reward, terminated, next_obs = episodes(end)
+    truncated = jnp.zeros_like(terminated).at[-1].set(True)
+    lam = lam if critic.lam is None else critic.lam
+    discount, trace = decay(terminated, truncated, gamma=0.5, lam=lam)
+    optimizer = optax.adam(optax.cosine_decay_schedule(0.05, steps))
+
+    def iteration(carry, key):
+        params, opt_state = carry
+        quantiles, next_quantiles = (critic.predict(params, x) for x in (obs, next_obs))
+        batch = make_batch(
+            obs,
+            value=quantiles.mean(-1),
+            target=critic.target(key, reward, discount, trace, quantiles, next_quantiles),
+            reward=reward,
+            discount=discount,
+            next_obs=next_obs,
+        )
+        batch = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), batch)
+        gradient = jax.grad(lambda p: critic.loss(p, batch)[0])(params)
+        updates, opt_state = optimizer.update(gradient, opt_state)
+        return (optax.apply_updates(params, updates), opt_state), None
+
+    @jax.jit
+    def fit(params):
+        keys = jax.random.split(jax.random.key(1), steps)
+        return jax.lax.scan(iteration, (params, optimizer.init(params)), keys)[0][0]
+
+    params = fit(critic.init(jax.random.key(0)))
+    states = {"first": FIRST, "second": SECOND, "end": END}
+    return {name: jnp.sort(critic.predict(params, obs)) for name, obs in states.items()}
+
+
+@pytest.mark.parametrize(
+    ("kind", "target", "lam", "end"),
+    [
+        ("quantile", "bellman", 0.5, "terminal"),
+        ("quantile", "bellman-frozen", 0.5, "terminal"),
+        ("quantile", "sr-lambda", 0.5, "terminal"),
+        ("quantile", "sr-lambda", 1.0, "terminal"),
+        ("quantile", "lambda-shift", 0.0, "terminal"),
+        ("quantile", "lambda-return", 1.0, "terminal"),
+        ("quantile", "monte-carlo", 0.0, "terminal"),
+        ("ordered", "bellman", 0.5, "terminal"),
+        ("ordered", "sr-lambda", 0.5, "terminal"),
+        ("ordered", "lambda-return", 1.0, "terminal"),
+        ("quantile", "bellman", 0.5, "absorbing"),
+        ("quantile", "sr-lambda", 0.5, "absorbing"),
+    ],
+)
+def test_the_critic_learns_the_true_quantiles(kind, target, lam, end):
+    got = fixed_point(kind, target, lam, end)
+    assert_allclose(got["first"], TRUE["first"], atol=0.1)
+    assert_allclose(got["second"], TRUE["second"], atol=0.1)
+
+
+def test_lambda_return_loses_the_spread_of_its_bootstrap():
+    # λ = 0: all quantiles see r + γ E[G(second)] = ±1
+    got = fixed_point("quantile", "lambda-return", 0.0)["first"]
+    assert_allclose(got, [-1, -1, 1, 1], atol=0.1)
+
+
+def test_lambda_shift_counts_the_spread_of_the_bootstrap_twice():
+    # λ = 1: the mean moves with the second coin and the shape holds it again: ±1 ± ½ ± ½
+    got = fixed_point("quantile", "lambda-shift", 1.0)["first"]
+    assert got.std() > 1.05 * jnp.array(TRUE["first"]).std()
+
+
+@pytest.mark.parametrize("target", TARGETS)
+def test_a_scalar_critic_learns_the_mean_from_every_target(target):
+    got = fixed_point("scalar", target, 0.5, steps=500)
+    assert_allclose([got["first"], got["second"]], 0, atol=0.05)
+
+
+# ---- losses ----
+
+
+@pytest.fixture(scope="module")
+def batch():
+    obs, next_obs = jax.random.normal(jax.random.key(0), (2, 24, 3))
+    reward = jax.random.normal(jax.random.key(1), (24,))
+    return make_batch(
+        obs,
+        target=reward[:, None],
+        reward=reward,
+        discount=jnp.full(24, 0.9),
+        next_obs=next_obs,
+    )
+
+
+@pytest.mark.parametrize("kind", CRITICS)
+@pytest.mark.parametrize("target", TARGETS)
+def test_every_critic_takes_every_target(kind, target, batch, key):
+    critic = make_critic(kind, target)
+    params = critic.init(key)
+    reward, discount, obs, next_obs = (
+        x.reshape(6, 4, *x.shape[1:])
+        for x in (batch.reward, batch.discount, batch.obs, batch.next_obs)
+    )
+    predictions = critic.predict(params, obs), critic.predict(params, next_obs)
+    got = critic.target(key, reward, discount, discount, *predictions)
+    outputs = 1 if kind == "scalar" else 4
+    assert got.shape == (6, 4, 1 if target == "lambda-return" else outputs)
+    fit = batch._replace(target=got.reshape(24, -1), value=predictions[0].mean(-1).ravel())
+    gradient = jax.grad(critic.loss, has_aux=True)(params, fit)[0]
+    assert 0 < float(optax.global_norm(gradient)) < 1e3
+
+
+@pytest.mark.parametrize(("target", "follows"), [("bellman", True), ("bellman-frozen", False)])
+def test_only_the_bellman_target_follows_the_critic(target, follows, batch, key):
+    critic = make_critic("quantile", target)
+    params = critic.init(key)
+    elsewhere = batch._replace(next_obs=batch.next_obs + 1)
+    changed = critic.loss(params, batch)[0] != critic.loss(params, elsewhere)[0]
+    assert changed == follows
+
+
+def test_no_gradient_flows_through_the_bellman_target(batch, key):
+    critic = make_critic("scalar", "bellman")
+    params = critic.init(key)
+    next_value = critic.predict(params, batch.next_obs)
+    target = batch.reward[:, None] + batch.discount[:, None] * next_value
+    want = jax.grad(lambda p: (0.5 * (critic.predict(p, batch.obs) - target) ** 2).mean())(params)
+    assert distance(jax.grad(critic.loss, has_aux=True)(params, batch)[0], want) < 1e-6
+
+
+def test_ordered_critic_fits_the_mean_and_the_crps_of_the_shape(key):
+    target = TARGETS["bellman-frozen"]
+    critic = ordered_critic(3, hidden=(), target=target, quantiles=8, kappa=1e-5)
+    params, targets, value = critic.init(key), jax.random.normal(key, (24, 5)), jnp.arange(24) / 12
+    batch = make_batch(jnp.zeros((24, 3)), target=targets, value=value)
+
+    @jax.jit
+    def by_output(params):
+        """Gradients of three losses by the network's outputs, its biases where obs is 0."""
+
+        def mean(p):
+            error = critic.predict(p, batch.obs).mean(-1) - targets.mean(-1)
+            return 8 / 2 * (0.5 * error**2).mean()
+
+        def shape(p):
+            quantiles = critic.predict(p, batch.obs)
+            about = quantiles - quantiles.mean(-1, keepdims=True) + value[:, None]
+            return 8 / 2 * jax.vmap(dg.crps, (None, -1))(about, targets).mean() / 64
+
+        losses = (lambda p: critic.loss(p, batch)[0]), mean, shape
+        return [jax.grad(loss)(params)["params"]["Dense_0"]["bias"] for loss in losses]
+
+    got, mean, shape = by_output(params)
+    assert_allclose(got[0], mean[0], rtol=1e-5)
+    assert_allclose(got[1:], shape[1:], rtol=1e-3, atol=1e-6)
+
+
+def test_a_sorted_critic_is_a_quantile_critic_with_sorted_predictions(batch, key):
+    options = {"hidden": (4,), "target": TARGETS["bellman"], "quantiles": 8, "kappa": 1.0}
+    plain, ordered = quantile_critic(3, **options), sorted_critic(3, **options)
+    params = plain.init(key)
+    predicted = plain.predict(params, batch.obs)
+    assert (jnp.diff(predicted) < 0).any()
+    assert_array_equal(ordered.predict(params, batch.obs), jnp.sort(predicted))
+    assert ordered.loss(params, batch)[0] == plain.loss(params, batch)[0]
+
+
+# ---- calibration ----
+
+
+def test_a_perfect_critic_of_a_normal_reward_is_calibrated(key):
+    # one-step episodes with a standard normal reward: quantiles Φ⁻¹(τ)
+    k, shape = 64, (500, 8)
+    reward, zero = jax.random.normal(key, shape), jnp.zeros(shape)
+    quantiles = jnp.broadcast_to(jax.scipy.stats.norm.ppf(quantile_midpoints(k)), (*shape, k))
+    got = critic_diagnostics(reward, zero, zero, quantiles, jnp.zeros_like(quantiles))
+    assert_allclose(got["critic/coverage_90"], 0.9, atol=0.015)
+    assert_allclose([got["critic/pit_mean"], got["critic/pit_std"]], [0.5, 1 / 12**0.5], atol=0.015)
+    assert_allclose(got["critic/wasserstein"], 2 / jnp.pi**0.5, atol=0.03)  # E|X − Y|
+    assert got["critic/crossing"] == 0
+
+
+def test_the_bootstrap_at_the_end_of_a_rollout_inflates_coverage(key):
+    # a perfect critic of N(0, 1) rewards, γ = 0.99: G ~ N(0, 1/(1 − γ²)); m steps before the end
+    # the outcome has the share 1 − γ²ᵐ of that variance, so that the interval of 90 % holds
+    # 2Φ(1.645/√(1 − γ²ᵐ)) − 1, on average 0.953 over m = 1 … 128
+    gamma, k, shape = 0.99, 64, (128, 400)
+    quantiles = jax.scipy.stats.norm.ppf(quantile_midpoints(k)) / (1 - gamma**2) ** 0.5
+    quantiles = jnp.broadcast_to(quantiles, (*shape, k))
+    reward, discount = jax.random.normal(key, shape), jnp.full(shape, gamma)
+    got = critic_diagnostics(reward, discount, jnp.ones(shape), quantiles, quantiles)
+    assert_allclose(got["critic/coverage_90"], 0.953, atol=0.015)
+
+
+def test_similar_means_with_different_shapes_are_counted():
+    # d = 0 against W₁ = 2, d = W₁ = 2, d = 0.5 against W₁ = 2
+    narrow, wide, shifted = jnp.array([-1.0, 1.0]), jnp.array([-3.0, 3.0]), jnp.array([1.0, 3.0])
+    quantiles = jnp.stack([narrow] * 3)[:, None]
+    next_quantiles = jnp.stack([wide, shifted, wide + 0.5])[:, None]
+    one, zero = jnp.ones((3, 1)), jnp.zeros((3, 1))
+    got = critic_diagnostics(zero, one, zero, quantiles, next_quantiles)
+    assert_allclose(got["critic/similar_means"], 1 / 3)
+
+
+def test_crossing_counts_neighbours_in_the_wrong_order():
+    quantiles, zero = jnp.array([[[0.0, 1.0, 0.5, 2.0]]]), jnp.zeros((1, 1))
+    got = critic_diagnostics(zero, zero, zero, quantiles, quantiles)
+    assert_allclose(got["critic/crossing"], 1 / 3)
