@@ -36,7 +36,7 @@ def all_of(task: str, width: int, seconds: float, samples: dict[str, int]) -> It
             task, algo, width, worlds, processes, threads, samples[algo], seconds
         )
         where = "processes" if processes else "one process"
-        name = f"stable-baselines3 {algo}, {task}, 2 × {width}, {worlds} worlds in {where}, {threads} threads"
+        name = f"stable-baselines3 {algo}, {task}, 2 × {width}, {worlds} envs in {where}, {threads} threads"
         yield Peer(task, algo, width, name, speed)
 
 

@@ -21,7 +21,7 @@ def all_of(task: str, width: int, seconds: float) -> Iterator[Peer]:
     """Each library in its layouts; one that cannot run here is left out with its reason."""
     for library, (measure, layouts) in LIBRARIES.items():
         for worlds in layouts:
-            name = f"{library} PPO, {task}, 2 × {width}, {worlds} worlds, `jax` physics"
+            name = f"{library} PPO, {task}, 2 × {width}, {worlds} envs, `jax` physics"
             try:
                 yield Peer(task, "PPO", width, name, measure(task, width, worlds, seconds))
             except Exception as reason:

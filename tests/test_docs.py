@@ -1,245 +1,197 @@
-"""What the documents print is run as it stands there."""
+"""The documents against the code and the files: blocks run, links resolve, tables are generated."""
 
+import inspect
 import json
+import pkgutil
 import re
 import shlex
 
-import numpy as np
 import pytest
 
+import dgae_jax
 from benchmarks.table import table
-from dgae_jax.cli import reproduce
-from dgae_jax.cli.arguments import parse_known
+from dgae_jax.cli import parse, reproduce, train
+from dgae_jax.cli.main import COMMANDS, command
 from dgae_jax.configs.algorithms import ALGORITHMS
-from dgae_jax.configs.parts import COVARIANCES, CRITICS, OPTIMIZERS, TARGETS, UPDATES
+from dgae_jax.configs.config import ConfigError
 from dgae_jax.configs.serial import to_dict
+from dgae_jax.learn.build import TABLES
 from dgae_jax.maths.risk import METRICS
-from dgae_jax.report import markdown, results, tables
+from dgae_jax.report import markdown, results
 from dgae_jax.report.groups import groups_of
-from dgae_jax.run import directory
+from dgae_jax.run import directory, metrics
+from dgae_jax.run.training import train_command
+from docs.site import configuration
 from tests.helpers import ROOT
+from tests.runs import QUIET, small
 
-DOCUMENTS = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
-TRAINS = re.compile(r"\b(train|train_step|learn)\(")
-"""What takes long; the README's are run by default."""
-
+DOCUMENTS = [ROOT / "README.md", ROOT / "CHANGELOG.md", *sorted((ROOT / "docs").rglob("*.md"))]
+TEXTS = {path: path.read_text() for path in DOCUMENTS}
+EACH = pytest.mark.parametrize("path", DOCUMENTS, ids=lambda path: str(path.relative_to(ROOT)))
+STUDIES = [path.name for path in sorted((ROOT / "results").iterdir())]
+FENCE = re.compile(r"^```(\w*)\n(.*?)^```", re.MULTILINE | re.DOTALL)
+SLOW = re.compile(r"\b(train|learn)\(|takes minutes")
 BLOCKS = [
-    pytest.param(
-        block,
-        id=f"{path.name}:{text[: text.index(block)].count(chr(10)) + 1}",
-        marks=pytest.mark.slow if TRAINS.search(block) and path.name != "README.md" else (),
-    )
-    for path in DOCUMENTS
-    for text in [path.read_text()]
-    for block in re.findall(r"^```python\n(.*?)^```", text, re.MULTILINE | re.DOTALL)
+    pytest.param(block[2], id=f"{path.name}:{number}", marks=[pytest.mark.slow] * slow)
+    for path, text in TEXTS.items()
+    for number, block in enumerate(FENCE.finditer(text), 1)
+    for slow in [bool(SLOW.search(block[2])) and path.name != "README.md"]
+    if block[1] == "python"
 ]
 
 
+def prose(path):
+    return FENCE.sub("", TEXTS[path])
+
+
+def anchors(path):
+    headings = re.findall(r"^#+ (.*)$", prose(path), re.MULTILINE)
+    return {re.sub(r"[^\w\- ]", "", line.lower()).strip().replace(" ", "-") for line in headings}
+
+
+def command_lines():
+    """Yield name and words of each command line in the documents."""
+    pattern = r"(?:^ {4,}|^|`|&& )dgae ([a-z]+)((?:\\\n|[^`\n&;)])*)"
+    for path in DOCUMENTS[:1] + DOCUMENTS[2:]:
+        for name, rest in re.findall(pattern, TEXTS[path], re.MULTILINE):
+            if name in COMMANDS and "…" not in rest:
+                yield name, shlex.split(rest.replace("\\\n", " "), comments=True)
+
+
 @pytest.mark.parametrize("block", BLOCKS)
-def test_a_block_of_code_runs_as_it_is_printed(block, monkeypatch, tmp_path):
+def test_code_blocks_run(block, monkeypatch, tmp_path):
     for package in re.findall(r"^# needs (\w+)$", block, re.MULTILINE):
         pytest.importorskip(package)
     monkeypatch.chdir(tmp_path)
-    kept = [
-        (table, dict(table))
-        for table in (ALGORITHMS, UPDATES, METRICS, COVARIANCES, CRITICS, OPTIMIZERS, TARGETS)
-    ]
+    tables = [ALGORITHMS, METRICS, *(each for pair in TABLES.values() for each in pair)]
+    kept = [dict(each) for each in tables]
     try:
         exec(compile(block, "document", "exec"), {"__name__": "document"})
     finally:
-        for table, before in kept:
-            table.clear()
-            table.update(before)
+        for each, before in zip(tables, kept, strict=True):
+            each.clear()
+            each.update(before)
 
 
-@pytest.mark.parametrize("path", DOCUMENTS, ids=lambda path: path.name)
-def test_modules_that_documents_name_exist(path):
-    for name in re.findall(
-        r"`((?:dgae_jax|experiments|benchmarks|tests|docs)/[\w/]+\.\w+)`", path.read_text()
-    ):
+@EACH
+def test_links_resolve(path):
+    for target in re.findall(r"\]\((?!https?:)([^)]+)\)", prose(path)):
+        name, _, anchor = target.partition("#")
+        file = (path.parent / name).resolve() if name else path
+        assert file.exists(), target
+        assert path.parent == ROOT or (ROOT / "docs") in file.parents, f"{target} leaves the site"
+        assert not anchor or anchor in anchors(file), target
+
+
+@EACH
+def test_named_files_exist(path):
+    names = r"`((?:dgae_jax|examples|experiments|benchmarks|tests|docs|results)/[\w/.-]+\.\w+)`"
+    for name in re.findall(names, TEXTS[path]):
         assert (ROOT / name).exists(), name
 
 
-@pytest.mark.parametrize("path", DOCUMENTS, ids=lambda path: path.name)
-def test_a_table_of_measurements_is_what_its_command_prints(path):
-    for file, block in re.findall(
-        r"<!-- python benchmarks/table\.py (\S+) -->\n(.*?)\n<!-- -->", path.read_text(), re.DOTALL
-    ):
-        assert block == table(json.loads((ROOT / file).read_text()))
+@pytest.mark.parametrize("study", STUDIES)
+def test_report_tables_equal_the_results(study, tmp_path):
+    groups = groups_of(results.read(ROOT / "results" / study).rows)
+    for path, text in TEXTS.items():
+        mine = re.search(rf"<!-- dgae report: [\w-]+ of {study} -->", text)
+        if mine or (study == "tuned" and path.name == "README.md"):
+            copy = tmp_path / path.name
+            copy.write_text(text)
+            markdown.replace(copy, groups, study)
+            assert copy.read_text() == text
 
 
-@pytest.mark.parametrize(
-    ("path", "study", "names"),
-    [
-        ("README.md", "tuned", ["returns"]),
-        ("docs/results.md", "tuned", ["returns", "improvement", "reach"]),
-        ("docs/results.md", "long", ["returns", "improvement"]),
-        ("docs/results.md", "swimmer-099", ["returns"]),
-        ("docs/decisions.md", "ant-lambda-095", ["returns"]),
-        ("docs/decisions.md", "hopper-gamma-099", ["returns"]),
-        ("docs/decisions.md", "swimmer-lambda-098", ["returns"]),
-        ("docs/decisions.md", "ordered", ["returns"]),
-        ("docs/decisions.md", "ordered-again", ["returns"]),
-        ("docs/reproduction.md", "paper", ["returns", "improvement"]),
-        ("docs/reproduction.md", "paper-one-step", ["returns"]),
-        ("docs/attribution.md", "attribution", ["attribution", "attribution-over-tasks"]),
-        ("docs/attribution.md", "attribution-hopper", ["attribution", "attribution-over-tasks"]),
-        ("docs/risk.md", "risk", ["risk"]),
-    ],
-)
-def test_the_tables_of_results_are_what_the_report_says(path, study, names, tmp_path):
-    document = tmp_path / "document.md"
-    document.write_bytes((ROOT / path).read_bytes())
-    assert (
-        markdown.replace(document, groups_of(results.read(ROOT / "results" / study).rows), study)
-        == names
-    )
-    assert document.read_bytes() == (ROOT / path).read_bytes()
+def test_benchmark_tables_equal_their_files():
+    pattern = r"<!-- python benchmarks/table\.py (\S+) -->\n(.*?)\n<!-- -->"
+    found = [pair for text in TEXTS.values() for pair in re.findall(pattern, text, re.DOTALL)]
+    assert found
+    for file, block in found:
+        assert block == table(json.loads((ROOT / file).read_text())), file
 
 
-SHARES = ("0.1", "0.03", "0.01", "0.003")
-"""Of W₁, at most which |d| makes means similar."""
-
-
-def of_critics(study):
-    """What the calibration of a study says of its critics: the rates of similar means by SHARES, and each critic's coverage."""
-    seeds = json.loads((ROOT / "results" / study / "calibration.json").read_text()).values()
-    return [np.mean([one["similar_means"][share] for one in seeds]) for share in SHARES], [
-        one["coverage_90"] for one in seeds
-    ]
-
-
-def test_the_rate_of_similar_means_is_the_mean_of_the_seeds_in_the_file_and_the_papers_at_the_threshold_that_is_named():
-    rates, _ = of_critics("attribution")
-    text = (ROOT / "docs" / "attribution.md").read_text()
-    assert f"| c | {' | '.join(SHARES)} |" in text
-    assert f"| steps | {' | '.join(f'{100 * rate:.2f} %' for rate in rates)} |" in text
-    assert (
-        round(float(np.interp(0.00093, rates[::-1], [float(share) for share in SHARES[::-1]])), 3)
-        == 0.005
-    )
-
-
-def test_the_critics_with_settings_that_suit_hopper_hold_and_differ_as_their_file_says():
-    rates, held = of_critics("attribution-hopper")
-    text = (ROOT / "docs" / "attribution.md").read_text()
-    *most, last = (f"{100 * rate:.2f} %" for rate in rates)
-    assert f"{', '.join(most)} and {last} (`results/attribution-hopper/calibration.json`" in text
-    assert f"hold {' · '.join(f'{100 * share:.0f}' for share in held)} % of the returns" in text
-
-
-def test_the_coverage_of_critics_with_monte_carlo_targets_is_what_the_files_say():
-    study, text = ROOT / "results" / "calibration", (ROOT / "docs" / "decisions.md").read_text()
-    returns = {row.cell: row.final for row in results.read(study).rows}
-    for run, statistics in json.loads((study / "calibration.json").read_text()).items():
-        assert (
-            f"| `{run}` | {returns[run]:,.0f} | {100 * statistics['coverage_90']:.0f} % |" in text
+@pytest.mark.parametrize(("name", "words"), list(command_lines()), ids=str)
+def test_commands_parse(name, words):
+    if "--help" in words:
+        return
+    try:
+        train.parsed(words) if name == "train" and "--resume" not in words else parse.arguments(
+            command(name).arguments, words
         )
+    except ConfigError as mistake:
+        assert "pip install" in str(mistake)
 
 
-def test_the_coverage_of_the_critics_of_the_preset_on_hopper_is_what_the_file_says():
-    held = json.loads((ROOT / "results" / "tuned" / "calibration.json").read_text())
-    cells = " · ".join(
-        f"{100 * held[f'hopper-dppo-{seed}']['coverage_90']:.0f}" for seed in range(5)
-    )
-    assert (
-        f"{cells} % of the returns in their central 90 %"
-        in (ROOT / "docs" / "decisions.md").read_text()
-    )
-
-
-@pytest.mark.parametrize("study", ["ordered", "ordered-again"])
-def test_the_coverage_of_ordered_quantiles_is_what_the_file_says(study):
-    held = json.loads((ROOT / "results" / study / "calibration.json").read_text())
-    tasks = [
-        [held.get(f"{task}-dppo-{seed}") for seed in range(5)]
-        for task in ("ant", "hopper", "walker2d")
-    ]
-    cells = [
-        " · ".join(f"{100 * found['coverage_90']:.0f}" for found in seeds if found) or "–"
-        for seeds in tasks
-    ]
-    assert (
-        f"| `results/{study}` | {' | '.join(cells)} |"
-        in (ROOT / "docs" / "decisions.md").read_text()
-    )
-
-
-def test_what_ordered_quantiles_cost_is_what_five_studies_say():
-    names = ("tuned", "ant-lambda-095", "hopper-gamma-099", "ordered", "ordered-again")
-    rows = [
-        row
-        for name in names
-        for row in results.read(ROOT / "results" / name).rows
-        if row.algo == "dppo"
-    ]
-    rows = [
-        row for row in rows if (row.config["gamma"], row.config["lam"]) == (0.99, 0.95)
-    ]  # as `ordered-again` has them
-    assert (
-        tables.markdown(tables.attribution(groups_of(rows)))
-        in (ROOT / "docs" / "decisions.md").read_text()
-    )
-
-
-def test_distributions_that_are_fitted_to_finished_policies_hold_what_the_documents_say():
-    rows = json.loads((ROOT / "benchmarks" / "results" / "refit.json").read_text())["rows"]
-    held = [100 * row["coverage_90"] for row in rows]
-    assert (
-        f"all {len(rows)} hold between {min(held):.0f} and {max(held):.0f} %"
-        in (ROOT / "docs" / "decisions.md").read_text()
-    )
-    assert not any(row["crossing"] for row in rows)
-    finals = {
-        f"{row.cell}.msgpack": row.final for row in results.read(ROOT / "results" / "tuned").rows
-    }
-    assert {row["checkpoint"]: row["return"] for row in rows}.items() <= finals.items()
-
-
-def test_the_returns_below_the_film_are_those_of_the_policies_in_it():
-    finals = {row.cell: row.final for row in results.read(ROOT / "results" / "tuned").rows}
-    shown = re.findall(
-        r"dgae refit results/tuned/policies/([\w-]+)\.msgpack",
-        (ROOT / "docs" / "results.md").read_text(),
-    )
-    *most, last = (f"{finals[cell]:,.0f}" for cell in shown)
-    assert f"return {', '.join(most)} and {last} on average" in (ROOT / "README.md").read_text()
-
-
-def test_a_committed_policy_is_there_for_every_result_and_knows_its_configuration():
-    for row in results.read(ROOT / "results" / "tuned").rows:
-        config = to_dict(
-            directory.config_of(ROOT / "results" / "tuned" / "policies" / f"{row.cell}.msgpack")
-        )
-        assert json.loads(json.dumps(config)) == row.config
-
-
-@pytest.mark.parametrize(
-    "study", sorted((ROOT / "results").iterdir()), ids=lambda study: study.name
-)
-def test_a_committed_result_names_a_command_that_writes_into_the_results(study):
-    rows = [
-        json.loads(line)["command"] for line in (study / "results.jsonl").read_text().splitlines()
-    ]
-    cells = json.loads((study / "study.json").read_text())["commands"].values()
-    assert all(command.startswith("dgae reproduce results/") for command in [*rows, *cells])
-
-
-@pytest.mark.parametrize(
-    "study", sorted((ROOT / "results").iterdir()), ids=lambda study: study.name
-)
-def test_the_commands_that_documents_give_for_a_study_make_the_configurations_of_its_rows(study):
+@pytest.mark.parametrize("study", STUDIES)
+def test_commands_make_the_configurations_of_the_results(study):
     made = {}
-    for command in re.findall(
-        rf"dgae reproduce (results/{study.name} [^`\n]+)",
-        "\n".join(path.read_text() for path in DOCUMENTS),
-    ):
-        arguments, rest = parse_known(
-            reproduce.Arguments, "", shlex.split(command, comments=True), rest=reproduce.REST
-        )
-        made |= {
-            cell.name: json.loads(json.dumps(to_dict(cell.config)))
-            for cell in reproduce._cells(arguments, rest)[0]
-        }
-    rows = results.read(study).rows
-    assert {row.cell: made.get(row.cell) for row in rows} == {row.cell: row.config for row in rows}
+    for name, words in command_lines():
+        if name == "reproduce" and words[0] == f"results/{study}":
+            made |= {run.name: to_dict(run.config) for run in reproduce.parsed(words)[1]}
+    rows = results.read(ROOT / "results" / study).rows
+    expected = {row.cell: row.config for row in rows}
+    assert {name: json.loads(json.dumps(made.get(name))) for name in expected} == expected
+
+
+def test_committed_policies_know_their_configuration():
+    for row in results.read(ROOT / "results" / "tuned").rows:
+        policy = ROOT / "results" / "tuned" / "policies" / f"{row.cell}.msgpack"
+        assert json.loads(json.dumps(to_dict(directory.read_config(policy)))) == row.config
+
+
+def test_configuration_page_equals_the_dataclasses():
+    assert configuration.PAGE.read_text() == configuration.page()
+
+
+def test_api_page_has_every_public_name_once():
+    names = re.findall(r"^::: dgae_jax\.(\w+)$", TEXTS[ROOT / "docs" / "api.md"], re.MULTILINE)
+    assert sorted(names) == sorted(dgae_jax.__all__)
+
+
+FAST = ("dppo", "dtrpo")
+
+
+@pytest.mark.parametrize(
+    "algo", [pytest.param(a, marks=[pytest.mark.slow] * (a not in FAST)) for a in ALGORITHMS]
+)
+def test_every_metric_is_documented(algo, tmp_path):
+    config = small(algo)
+    config = config.as_config().replace(
+        total_steps=2 * config.samples_per_iteration, diagnostics=config.critic.is_distribution
+    )
+    config = dgae_jax.resolve(config)
+    options = QUIET.__class__(**{**vars(QUIET), "run_dir": tmp_path / "run"})
+    assert train_command(config, options) == 0
+    kinds = {"all", config.policy.update} | ({"diagnostics"} if config.diagnostics else set())
+    lines = TEXTS[ROOT / "docs" / "algorithms.md"].split("## Metrics\n")[1].splitlines()
+    cells = [line.split("|")[1:3] for line in lines if line.startswith("| `")]
+    documented = {
+        name
+        for names, where in cells
+        for name in re.findall(r"`([\w/]+)`", names)
+        if kinds & set(where.strip().split(", "))
+    }
+    for row in metrics.read(tmp_path / "run" / "metrics.jsonl"):
+        assert set(row) == documented
+
+
+THEORY = TEXTS[ROOT / "docs" / "theory.md"].split("\n## ")[0]
+ROWS = [line.strip("|").split("|") for line in THEORY.splitlines() if line.startswith("| ")][1:]
+
+
+@pytest.mark.parametrize(
+    ("name", "labels"),
+    [(n, re.findall(r":(\w+)`", r[1])) for r in ROWS for n in re.findall(r"`([\w.]+)`", r[2])],
+)
+def test_docstrings_cite_the_equations_of_the_theory_page(name, labels):
+    function = pkgutil.resolve_name(f"dgae_jax.{name}")
+    assert any(label in (inspect.getdoc(function) or "") for label in labels)
+
+
+def test_theory_page_has_every_statement_of_the_paper():
+    paper = ROOT.parent / "shared" / "paper" / "dgae.tex"
+    if not paper.exists():
+        pytest.skip("the source of the paper is not here")
+    labels = re.findall(r"\\label\{((?:eq|def|lem|alg):\w+)\}", paper.read_text())
+    listed = [label for row in ROWS for label in re.findall(r"`((?!sec)\w+:\w+)`", row[1])]
+    assert sorted(labels) == sorted(listed)
