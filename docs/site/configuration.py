@@ -29,11 +29,11 @@ HEAD = """# Configuration
 
 Written by `python -m docs.site.configuration` from the dataclasses.
 
-A setting's path is its flag: `config.replace(**{"policy.clip_eps": 0.3})` is `--policy.clip-eps 0.3`;
-booleans are `--name` or `--no-name`. Settings start from `--preset tuned` or `paper`, from `--config
-FILE` or, in Python, from `dgae_jax.Config()`. *Unset* ones are filled in; one without effect is an
-error. Former names (`horizon`, `lam`, `policy.clip`, `policy.radius`, `policy.backtracks`) are still
-read.
+A setting's path is its flag: `config.replace(**{"policy.clip_eps": 0.3})` is
+`--policy.clip-eps 0.3`; booleans are `--name` or `--no-name`. Settings start from `--preset tuned`
+or `paper`, from `--config FILE` or, in Python, from `dgae_jax.Config()`. *Unset* ones are filled
+in; one without effect is an error. Former names (`horizon`, `lam`, `policy.clip`, `policy.radius`,
+`policy.backtracks`) are still read.
 """
 
 
@@ -78,10 +78,10 @@ def _fields(fields: Any, classes: tuple[type, ...], prefix: str = "") -> str:
 
 def _docstrings(cls: type) -> dict[str, str]:
     """Return the string below each field of a dataclass."""
-    body = ast.parse(textwrap.dedent(inspect.getsource(cls))).body[0].body  # pyright: ignore[reportAttributeAccessIssue]
+    tree: Any = ast.parse(textwrap.dedent(inspect.getsource(cls)))
     return {
         ast.unparse(field.target): " ".join(ast.literal_eval(below.value).split())
-        for field, below in pairwise(body)
+        for field, below in pairwise(tree.body[0].body)
         if isinstance(field, ast.AnnAssign) and isinstance(below, ast.Expr)
     }
 
@@ -109,7 +109,7 @@ def _presets() -> str:
         where: dict[str, dict[str, list[str]]] = {}
         for algo in ALGORITHMS:
             for env in TASKS:
-                start = Config(env=env, algo=algo)
+                start = Config(env=env).replace(algo=algo)
                 for setting in _changed(preset(name, algo, env), start):
                     where.setdefault(setting, {}).setdefault(algo, []).append(env)
         groups: dict[tuple[str, str], list[str]] = {}

@@ -1,4 +1,4 @@
-"""Formulas of the documentation: a block of LaTeX becomes MathML while the site is built, so that a page needs no script for it."""
+"""Formulas of the documentation as MathML, which needs no script."""
 
 import re
 from typing import Any
@@ -8,10 +8,10 @@ from pymdownx.superfences import SuperFencesException
 
 
 def block(source: str, *_: Any, **__: Any) -> str:
-    """The HTML of a ```math block, which GitHub shows as a formula too; called by pymdownx.superfences.
+    """Return the HTML of a ```math block; pymdownx.superfences calls it.
 
-    Raises SuperFencesException, which ends the build, for a command or an environment that the converter does not know and would
-    print as it stands.
+    Raises:
+        SuperFencesException: the converter does not know a command; it ends the build.
     """
     formula = convert(source, display="block")
     unknown = re.findall(r"\\\w+|>&<", formula)

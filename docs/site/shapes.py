@@ -1,4 +1,4 @@
-"""Shapes in the signatures of the API page as they stand in the source: `Float[Array, "T *batch"]`, not a product of T and batch."""
+"""Shapes in signatures of the API page as they are in the source."""
 
 import ast
 from typing import Any
@@ -7,7 +7,7 @@ import griffe
 
 
 class Shapes(griffe.Extension):
-    """Leaves strings inside annotations alone, which are taken for the names of types otherwise."""
+    """Leave strings inside annotations alone; they would be taken for names of types."""
 
     def on_function_instance(self, *, node: Any, func: griffe.Function, **_: Any) -> None:
         """Read the annotations of a function again."""
