@@ -1,0 +1,79 @@
+"""A trained run, and policies without training."""
+
+import dataclasses
+from typing import NamedTuple
+
+import jax
+import numpy as np
+import pytest
+
+import dgae_jax as dg
+from dgae_jax.configs.resolved import resolve
+from dgae_jax.learn.types import InferenceState
+from dgae_jax.run import checkpoint
+from dgae_jax.run.training import train
+from tests.runs import QUIET, small
+
+
+@pytest.fixture(scope="session")
+def trained(tmp_path_factory):
+    """The directory of a run with two seeds."""
+    run_dir = tmp_path_factory.mktemp("runs") / "dppo"
+    train(small("dppo", seeds=2), dataclasses.replace(QUIET, run_dir=run_dir))
+    return run_dir
+
+
+def _config(algo, kind, **changes):
+    parts = {"critic.kind": kind, "critic.kappa": None, "policy.hidden": (8, 6)}
+    config = small(algo).as_config().replace(**{**parts, "critic.hidden": (8, 6), **changes})
+    return resolve(config)
+
+
+CONFIGS = {
+    "quantile": _config("dppo", "quantile"),
+    "ordered": _config("dppo", "ordered"),
+    "sorted": _config("dppo", "sorted"),
+    "scalar": _config(
+        "trpo",
+        "scalar",
+        **{"policy.covariance": "state", "policy.hidden": (8,), "num_seeds": 2},
+        normalize_observations=False,
+        normalize_rewards=False,
+    ),
+}
+"""All critics, both covariances, with and without normalization, one seed and two."""
+
+
+class Untrained(NamedTuple):
+    """The file of a policy with random networks."""
+
+    name: str
+    config: dg.Config
+    index: int
+    file: str
+    networks: checkpoint.Networks
+
+    @property
+    def policy(self):
+        return dg.load_policy(self.file, seed=self.index)
+
+
+@pytest.fixture(scope="session", params=CONFIGS)
+def untrained(request, tmp_path_factory):
+    """A policy with actions that reach the actuators' range, for each kind of critic."""
+    return make_untrained(request.param, tmp_path_factory.mktemp("untrained"))
+
+
+def make_untrained(name, directory):
+    rng, config = np.random.default_rng(0), CONFIGS[name]
+    blank = checkpoint._blank(config)
+    policy, critic = (
+        jax.tree.map(lambda x: rng.normal(0, 0.5, x.shape).astype(x.dtype), each.params)
+        for each in (blank.policy, blank.critic)
+    )
+    stats = jax.tree.map(lambda x: rng.uniform(0.5, 2, x.shape).astype(x.dtype), blank.obs_stats)
+    file = directory / f"{name}.msgpack"
+    states = InferenceState(policy, stats), InferenceState(critic, stats)
+    networks = checkpoint.Networks(*states, file)
+    checkpoint.save_networks(file, config, networks, np.full(config.num_seeds, 2.0))
+    return Untrained(name, config, config.num_seeds - 1, file, networks)
