@@ -16,14 +16,14 @@ from dgae_jax.cli import train
 from dgae_jax.cli.arguments import fail, flags_in, parse_known, stopped
 from dgae_jax.configs.algorithms import ALGORITHMS
 from dgae_jax.configs.config import Config, ConfigError, invalid
-from dgae_jax.configs.resolved import ResolvedConfig
+from dgae_jax.configs.resolved import ResolvedConfig, resolve
 from dgae_jax.configs.validation import lookup, task_spec
 from dgae_jax.envs.registry import TASKS
 from dgae_jax.run import terminal
 from dgae_jax.run.options import RunOptions, saved_options
-from dgae_jax.study import matrix
+from dgae_jax.study import sweep as sweeps
 from dgae_jax.study.launch import LaunchOptions, launcher
-from dgae_jax.study.variants import VARIANTS
+from dgae_jax.study.variants import Variant, variants
 
 PURPOSE = "Train the cells of a study: tasks, algorithms and seeds."
 
@@ -75,7 +75,7 @@ def main() -> int:
         arguments, rest = parse_known(Arguments, PURPOSE, sys.argv[1:], EXAMPLES, NOTE, REST)
         cells, options = _cells(arguments, rest)
         launch = launcher(arguments.launch)
-        with matrix.opened(
+        with sweeps.opened(
             arguments.study, cells, shlex.join(["dgae", "reproduce", *sys.argv[1:]])
         ) as study:
             from dgae_jax.study.reproduce import reproduce
@@ -87,7 +87,7 @@ def main() -> int:
         return stopped("stopped by SIGINT before training began")
 
 
-def _cells(arguments: Arguments, rest: list[str]) -> tuple[list[matrix.Cell], RunOptions]:
+def _cells(arguments: Arguments, rest: list[str]) -> tuple[list[sweeps.RunSpec], RunOptions]:
     """What the command line means; raises ConfigError for the first thing that is invalid."""
     for name in ("envs", "algos", "seeds"):
         given = getattr(arguments, name)
@@ -121,12 +121,13 @@ def _cells(arguments: Arguments, rest: list[str]) -> tuple[list[matrix.Cell], Ru
             if arguments.config
             else ["--preset", arguments.preset]
         )
-        algo, *words = kinds[kind].split()
-        config, options = train.parsed([*start, "--env", task, "--algo", algo, *words, *rest])
+        algo, changes = kinds[kind]
+        config, options = train.parsed([*start, "--env", task, "--algo", algo, *rest])
+        config = resolve(config.as_config().replace(**changes))
         _refuse(config, options, task, algo)
         return config if arguments.scale == 1 else _scaled(config, arguments.scale)
 
-    cells = matrix.matrix(
+    cells = sweeps.grid(
         arguments.envs, list(kinds), arguments.seeds, arguments.seeds_per_run, make
     )
     return cells, dataclasses.replace(options, inexact=arguments.inexact)
@@ -144,10 +145,10 @@ def _scaled(config: ResolvedConfig, scale: float) -> ResolvedConfig:
     return dataclasses.replace(config, total_steps=steps)
 
 
-def _kinds(arguments: Arguments, rest: list[str]) -> dict[str, str]:
-    """What is trained on each task by its name: an algorithm, and flags."""
+def _kinds(arguments: Arguments, rest: list[str]) -> dict[str, Variant]:
+    """What is trained on each task by its name: an algorithm, and settings."""
     if arguments.variants is None:
-        return {algo: algo for algo in arguments.algos}
+        return {algo: (algo, {}) for algo in arguments.algos}
     if arguments.config:
         raise invalid(
             "config",
@@ -156,8 +157,9 @@ def _kinds(arguments: Arguments, rest: list[str]) -> dict[str, str]:
         )
     if arguments.algos != Arguments.algos:
         raise invalid("algos", arguments.algos, "left out with --variants")
-    kinds = lookup("variants", arguments.variants, VARIANTS)
-    for name in sorted(flags_in(rest) & flags_in(" ".join(kinds.values()).split())):
+    kinds = variants(arguments.variants)
+    set_by_them = {f"--{path.replace('_', '-')}" for _, changes in kinds.values() for path in changes}
+    for name in sorted(flags_in(rest) & set_by_them):
         raise ConfigError(
             f"{name}: must be left out with --variants {arguments.variants}, whose variants set it"
         )

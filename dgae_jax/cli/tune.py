@@ -8,15 +8,15 @@ import sys
 from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from dgae_jax.cli import train
 from dgae_jax.cli.arguments import fail, flags_in, parse_known, stopped
 from dgae_jax.configs.config import ConfigError, invalid
 from dgae_jax.run import terminal
-from dgae_jax.run.options import RunOptions
-from dgae_jax.study.search import USUAL, is_traced, space_of, values_of
-from dgae_jax.study.tune import tune
-from dgae_jax.study.tuning import Tuning
+
+if TYPE_CHECKING:
+    from dgae_jax.study.search import Tuning
 
 PURPOSE = "Search for the settings with the highest return in Gymnasium, with Optuna."
 
@@ -34,7 +34,7 @@ EXAMPLES = (
 class Arguments:
     """What to search, how long, and with whom."""
 
-    search: tuple[str, ...] = USUAL
+    search: tuple[str, ...] = ("gamma=0.95:0.9999", "gae_lambda=0.5:1")
     """Settings and where to look: gamma=0.95:0.999, policy.learning_rate=log:1e-4:1e-2, num_envs=int:4:64 (or int:log:4:64),
     critic.minibatches=16,32,64, policy.hidden=64x64,256x256."""
     trials: int = 50
@@ -46,10 +46,7 @@ class Arguments:
     storage: str | None = None
     """Database that machines share, postgresql://USER:PASSWORD@HOST/NAME; by default optuna.db (SQLite) in the directory [URL]."""
     workers: int | None = None
-    """Processes on this machine, each on cores of its own; by default one per core, or one with --side-by-side [processes]."""
-    side_by_side: int = 1
-    """Trials of a worker that are trained at once in one program; only settings that are not whole numbers or names can be searched
-    so [trials]."""
+    """Processes on this machine, each on cores of its own; by default one per core [processes]."""
     sampler_seed: int = 0
     """Seed of what is tried; with several workers the order in which they finish matters too [1]."""
 
@@ -57,7 +54,6 @@ class Arguments:
 WHOLE = {
     "trials": (1, 100_000, "Optuna reads all of them before each"),
     "tuning_seeds": (1, 100, "every one is a whole run"),
-    "side_by_side": (1, 4096, "every one is a whole run in the same program"),
     "sampler_seed": (0, 2**31 - 1, "an int32"),
 }
 """Whole numbers: from, to, and why not more."""
@@ -91,14 +87,17 @@ def main() -> int:
     """Tune; 0 done, 1 workers broke down, 2 bad input, 129 / 130 / 143 stopped by SIGHUP / SIGINT / SIGTERM."""
     terminal.prepare()
     try:
-        return tune(_tuning(sys.argv[1:]))
+        tuning = _tuning(sys.argv[1:])
+        from dgae_jax.study.tune import tune
+
+        return tune(tuning)
     except ConfigError as mistake:
         fail(mistake)
     except KeyboardInterrupt:
         return stopped("stopped by SIGINT; the same command goes on")
 
 
-def _tuning(argv: list[str]) -> Tuning:
+def _tuning(argv: list[str]) -> "Tuning":
     """What a command line means; raises ConfigError for the first argument that is invalid."""
     arguments, rest = parse_known(Arguments, PURPOSE, argv, EXAMPLES, NOTE, REST)
     given = flags_in(rest)
@@ -106,43 +105,29 @@ def _tuning(argv: list[str]) -> Tuning:
         for name in given.intersection(names):
             raise ConfigError(f"{name}: must be {why}")
     config, options = train.parsed(rest)
-    _check(arguments, options)
+    _check(arguments)
     storage = _storage(arguments.storage)
-    space = space_of(arguments.search, config)
-    if arguments.side_by_side > 1 and (fixed := [path for path in space if not is_traced(path)]):
-        raise invalid(
-            "side_by_side",
-            arguments.side_by_side,
-            f"1: another {' or '.join(fixed)} is another program",
-        )
-    tuning = Tuning(
-        config, space, arguments.study or Path("tuning") / f"{config.task}-{config.algo}".replace(":", "-"), options, storage,
-        arguments.trials, arguments.tuning_seeds, _workers(arguments), arguments.side_by_side, arguments.sampler_seed,
-    )  # fmt: skip
-    tuning.config_of(values_of(config, space))
-    return tuning
+    from dgae_jax.study.search import Tuning, space_of
+
+    return Tuning(
+        config,
+        space_of(arguments.search, config),
+        arguments.study or Path("tuning") / f"{config.task}-{config.algo}".replace(":", "-"),
+        options,
+        storage,
+        arguments.trials,
+        arguments.tuning_seeds,
+        _workers(arguments),
+        arguments.sampler_seed,
+    )
 
 
-def _check(arguments: Arguments, options: RunOptions) -> None:
+def _check(arguments: Arguments) -> None:
     for name, (low, high, reason) in WHOLE.items():
         if not low <= (value := getattr(arguments, name)) <= high:
             raise invalid(name, value, f"a whole number from {low:,} to {high:,} ({reason})")
     if not arguments.search:
         raise ConfigError("--search: must name a setting, gamma=0.95:0.999 for one")
-    if arguments.side_by_side > 1:
-        if options.devices not in (None, 1):
-            raise invalid(
-                "devices",
-                options.devices,
-                "left out with --side-by-side, whose program runs on one",
-            )
-        for name in ("log", "debug_nonfinite"):
-            if value := getattr(options, name):
-                raise invalid(
-                    name,
-                    value,
-                    "left out with --side-by-side, whose trials have no run directories",
-                )
     if arguments.study is not None and not re.fullmatch(
         r"[^/\0]{1,200}", arguments.study.absolute().name
     ):
@@ -175,7 +160,7 @@ def _workers(arguments: Arguments) -> int:
 
     wanted, there = arguments.workers, cores()
     if wanted is None:
-        return 1 if arguments.side_by_side > 1 else min(there, arguments.trials)
+        return min(there, arguments.trials)
     if not 1 <= wanted <= there:
         raise invalid(
             "workers", wanted, f"a whole number from 1 to {there}, the cores of this machine"

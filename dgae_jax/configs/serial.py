@@ -1,6 +1,8 @@
 """Configurations as plain data, for JSON: written whole, read strictly, old schemas upgraded."""
 
 import dataclasses
+import hashlib
+import json
 from collections.abc import Mapping
 from typing import Any, get_type_hints
 
@@ -73,6 +75,12 @@ def _renamed(settings: Mapping[str, Any], names: Mapping[str, str], prefix: str 
         new(name): _renamed(value, names, f"{name}.") if isinstance(value, dict) else value
         for name, value in settings.items()
     }
+
+
+def digest(config: Config | ResolvedConfig) -> str:
+    """Return a hash that configurations share which differ in nothing but their seeds."""
+    plain = to_dict(dataclasses.replace(config, seed=0, num_seeds=1))
+    return hashlib.sha256(json.dumps(plain, sort_keys=True).encode()).hexdigest()[:12]
 
 
 def flat(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:

@@ -314,6 +314,8 @@ def train(
         there = options.run_dir is not None and directory.has_begun(options.run_dir)
         if runtime.of_first(there):
             options = dataclasses.replace(options, resume=options.run_dir, run_dir=None)
+        else:
+            options = dataclasses.replace(options, inexact=False)
         options = dataclasses.replace(options, resume_or_start=False)
     config, options = prepare(config, options)
     if options.resume is None:

@@ -1,72 +1,80 @@
-"""Who trains the cells of a study: this machine, a Ray cluster or Slurm.
+"""Launchers of a sweep: this machine, a Ray cluster or Slurm.
 
-A launcher is `launch(jobs, options)`, a context in which all jobs are on their way: tasks with `done()` and `result()`, the exit code
-of the cell. Leaving it before they are done stops them, each with a checkpoint, but for Slurm's, which are in the hands of Slurm.
+A launcher is `launch(jobs, options)`, a context in which all jobs are on their way: a dictionary
+of tasks with `done()` and `result()`, the exit code of the run. On leaving it, runs that are not
+done stop with a checkpoint; those of Slurm go on.
 """
 
 import contextlib
+import logging
 import os
 import queue
+import shutil
+import socket
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from importlib.util import find_spec
-from typing import Protocol
+from typing import Any, Protocol
 
-from dgae_jax.configs.config import invalid
+from dgae_jax.configs.config import ConfigError, invalid
 from dgae_jax.configs.validation import lookup
 from dgae_jax.physics.cores import cores
-from dgae_jax.study import on_ray, on_slurm
-from dgae_jax.study.work import Job, run
+from dgae_jax.study.worker import Job, execute
 
 
 @dataclass(frozen=True)
 class LaunchOptions:
-    """Where the cells of a study are trained."""
+    """Where the runs of a sweep are trained."""
 
     launcher: str = "local"
     """local (this machine), ray (a cluster) or slurm (an array of jobs)."""
     processes: int | None = None
-    """local: runs at a time, each with as many of the cores; by default one per core, one in all with a GPU [processes]."""
+    """local: runs at a time, each with an equal share of the cores; by default one per core, or
+    one in all with a GPU [processes]."""
     address: str | None = None
-    """ray: HOST:PORT of the cluster's head, or auto; by default a cluster of this machine's own [address]."""
+    """ray: HOST:PORT of the cluster's head, or auto; by default a cluster on this machine
+    [address]."""
     cpus_per_run: int = 1
     """ray, slurm: cores of each run [cores]."""
     gpus_per_run: float = 0.0
     """ray, slurm: GPUs of each run; several runs may share one with ray [GPUs]."""
     slurm: tuple[str, ...] = ()
-    """slurm: more of its settings, as partition=gpu time=240 (minutes) array_parallelism=32 [NAME=VALUE]."""
+    """slurm: more of its settings, as partition=gpu time=240 (minutes) array_parallelism=32
+    [NAME=VALUE]."""
 
 
 class Task(Protocol):
-    """A cell on its way."""
+    """A run on its way."""
 
     def done(self) -> bool:
-        """Whether there is a result."""
+        """Return whether there is a result."""
         ...
 
     def result(self) -> int:
-        """The exit code of the cell; raises whatever kept it from having one."""
+        """Return the exit code of the run; raise what kept it from having one."""
         ...
 
 
-Launcher = Callable[[Sequence[Job], LaunchOptions], AbstractContextManager[dict[Task, Job]]]
-"""All jobs on their way."""
+Tasks = dict[Task, Job]
+Launcher = Callable[[Sequence[Job], LaunchOptions], AbstractContextManager[Tasks]]
+Launch = Callable[[Sequence[Job]], AbstractContextManager[Tasks]]
+"""A launcher with its options."""
 
 
 @contextlib.contextmanager
-def local(jobs: Sequence[Job], options: LaunchOptions) -> Iterator[dict[Task, Job]]:
-    """As many processes at a time as there are cores to give."""
+def local(jobs: Sequence[Job], options: LaunchOptions) -> Iterator[Tasks]:
+    """Run as many processes at a time as there are shares of the cores."""
     shares: queue.SimpleQueue[list[int]] = queue.SimpleQueue()
-    for share in _shares(options.processes or _processes()):
+    for share in _shares(options.processes or _default_processes()):
         shares.put(share)
-    ours, theirs = os.pipe()  # a cell lives as long as its input is open
+    read_end, write_end = os.pipe()
 
     def work(job: Job) -> int:
         share = shares.get()
         try:
-            return run(job, share, ours)
+            return execute(job, share, read_end)
         finally:
             shares.put(share)
 
@@ -74,24 +82,20 @@ def local(jobs: Sequence[Job], options: LaunchOptions) -> Iterator[dict[Task, Jo
         try:
             yield {pool.submit(work, job): job for job in jobs}
         finally:
-            os.close(theirs)
+            os.close(write_end)
             pool.shutdown(cancel_futures=True)
-            os.close(ours)
+            os.close(read_end)
 
 
-def _processes() -> int:
-    """Programs on a CPU gain less from a second core than a second program does; a GPU is filled by one."""
-    accelerated = (
-        any(find_spec(name) for name in ("jax_cuda12_plugin", "jax_cuda13_plugin"))
-        and os.environ.get("JAX_PLATFORMS") != "cpu"
-    )
-    return 1 if accelerated else cores()
+def _default_processes() -> int:
+    """Return one per core, as a run gains less from a second core than a second run does."""
+    plugins = ("jax_cuda12_plugin", "jax_cuda13_plugin")
+    has_gpu = any(map(find_spec, plugins)) and os.environ.get("JAX_PLATFORMS") != "cpu"
+    return 1 if has_gpu else cores()
 
 
 def _shares(processes: int) -> list[list[int]]:
-    """The cores of this process divided between so many, as many for each, because a cell goes on with the number that it was begun with;
-    at least one. None is pinned where there is one process, or no pinning.
-    """
+    """Divide the cores evenly, because a run resumes with the number of cores it began with."""
     if processes == 1 or not hasattr(os, "sched_getaffinity"):
         return [[] for _ in range(processes)]
     ours = sorted(os.sched_getaffinity(0))
@@ -99,40 +103,140 @@ def _shares(processes: int) -> list[list[int]]:
     return [[ours[(each * i + k) % len(ours)] for k in range(each)] for i in range(processes)]
 
 
-LAUNCHERS: dict[str, Launcher] = {"local": local, "ray": on_ray.launch, "slurm": on_slurm.launch}
-"""By name."""
+@contextlib.contextmanager
+def ray_cluster(jobs: Sequence[Job], options: LaunchOptions) -> Iterator[Tasks]:
+    """Run jobs as tasks of a Ray cluster whose nodes share the sweep's directory.
+
+    A task whose node dies is retried on another, and resumes from the checkpoint of its run.
+    """
+    import ray  # pyright: ignore[reportMissingImports]
+
+    try:
+        ray.init(
+            options.address or "local",
+            log_to_driver=False,
+            logging_level=logging.ERROR,
+            ignore_reinit_error=True,
+        )
+    except (ConnectionError, RuntimeError, ValueError) as reason:
+        raise _no_cluster(options.address, str(reason).partition("\n")[0][:200]) from reason
+    resources: Any = {"num_cpus": options.cpus_per_run, "num_gpus": options.gpus_per_run}
+    task = ray.remote(max_retries=-1, **resources)(execute)
+    try:
+        yield {task.remote(job).future(): job for job in jobs}
+    finally:
+        ray.shutdown()
 
 
-_MEANT_FOR = {
+def _check_ray(options: LaunchOptions) -> None:
+    address = options.address
+    is_remote = address not in (None, "auto", "local")
+    host, _, port = str(address).removeprefix("ray://").rpartition(":")
+    if is_remote and not (host and port.isdigit()):
+        raise invalid("address", address, "HOST:PORT of a cluster, or auto")
+    if not find_spec("ray"):
+        raise invalid("launcher", "ray", 'used with Ray installed: pip install "dgae_jax[ray]"')
+    if is_remote:
+        try:
+            socket.create_connection((host, int(port)), timeout=5.0).close()
+        except (OSError, OverflowError) as reason:
+            raise _no_cluster(address, reason) from reason
+
+
+def _no_cluster(address: str | None, reason: Any) -> ConfigError:
+    return invalid("address", address, f"where a Ray cluster answers ({reason})")
+
+
+SLURM_EXECUTOR = "slurm"
+"""Name of submitit's executor; tests use its `local` one."""
+
+
+class _ResumableJob:
+    """Function that submitit calls, and submits again if the job was preempted or timed out."""
+
+    def __call__(self, job: Job) -> int:
+        return execute(job)
+
+    def checkpoint(self, job: Job) -> Any:
+        from submitit.helpers import DelayedSubmission
+
+        return DelayedSubmission(self, job)
+
+
+@contextlib.contextmanager
+def slurm_array(jobs: Sequence[Job], options: LaunchOptions) -> Iterator[Tasks]:
+    """Run jobs as one Slurm array, which goes on when this process ends."""
+    import submitit
+
+    folder = jobs[0].sweep.path / "slurm" / "%j"
+    executor = submitit.AutoExecutor(folder=folder, cluster=SLURM_EXECUTOR)
+    gpus = {"gpus_per_node": int(options.gpus_per_run)} if options.gpus_per_run else {}
+    try:
+        executor.update_parameters(
+            name="dgae", cpus_per_task=options.cpus_per_run, **gpus, **slurm_parameters(options)
+        )
+        submitted: Any = executor.map_array(_ResumableJob(), jobs)
+    except (NameError, TypeError, submitit.core.utils.FailedSubmissionError) as reason:
+        allowed = f"must be settings that submitit and Slurm take ({str(reason)[:300]})"
+        raise ConfigError(f"slurm: {allowed}", "slurm") from reason
+    yield dict(zip(submitted, jobs, strict=True))
+
+
+def slurm_parameters(options: LaunchOptions) -> dict[str, Any]:
+    """Return submitit's parameters; raise ConfigError for a setting that is not NAME=VALUE."""
+    found = {}
+    for setting in options.slurm:
+        name, _, value = setting.partition("=")
+        if not (name.isidentifier() and value):
+            raise invalid("slurm", setting, "NAME=VALUE, as partition=gpu")
+        found[f"slurm_{name.removeprefix('slurm_')}"] = int(value) if value.isdigit() else value
+    return found
+
+
+def _check_slurm(options: LaunchOptions) -> None:
+    if not find_spec("submitit"):
+        how = 'used with submitit installed: pip install "dgae_jax[slurm]"'
+        raise invalid("launcher", "slurm", how)
+    if SLURM_EXECUTOR == "slurm" and not shutil.which("sbatch"):
+        raise invalid("launcher", "slurm", "used where Slurm is: there is no sbatch here")
+    if options.gpus_per_run != int(options.gpus_per_run):
+        raise invalid("gpus_per_run", options.gpus_per_run, "a whole number with --launcher slurm")
+    slurm_parameters(options)
+
+
+LAUNCHERS: dict[str, Launcher] = {"local": local, "ray": ray_cluster, "slurm": slurm_array}
+
+CHECKS = {"ray": _check_ray, "slurm": _check_slurm}
+
+USED_BY = {
     "processes": ("local",),
     "address": ("ray",),
     "cpus_per_run": ("ray", "slurm"),
     "gpus_per_run": ("ray", "slurm"),
     "slurm": ("slurm",),
 }
-"""The launchers that take a setting."""
-
-
-Launch = Callable[[Sequence[Job]], AbstractContextManager[dict[Task, Job]]]
-"""A launcher that knows its options."""
+"""The launchers that use a setting."""
 
 
 def launcher(options: LaunchOptions) -> Launch:
-    """The one that is asked for, after a look at everything that can be seen at once; raises ConfigError."""
+    """Return the launcher that is asked for.
+
+    Raises:
+        ConfigError: an option is invalid, or Ray or Slurm is not there.
+    """
     found = lookup("launcher", options.launcher, LAUNCHERS)
-    usual = LaunchOptions()
-    for name, meant in _MEANT_FOR.items():
+    for name, used_by in USED_BY.items():
         value = getattr(options, name)
-        if value != getattr(usual, name) and options.launcher not in meant:
-            raise invalid(name, value, f"left out with --launcher {options.launcher}")
-    if options.processes is not None and not 1 <= options.processes <= 1024:
-        raise invalid("processes", options.processes, "a whole number from 1 to 1,024")
-    if not 1 <= options.cpus_per_run <= 1024:
-        raise invalid("cpus_per_run", options.cpus_per_run, "a whole number from 1 to 1,024")
+        if value != getattr(LaunchOptions(), name) and options.launcher not in used_by:
+            raise invalid(
+                name, value, f"unset: it has no effect with --launcher {options.launcher}"
+            )
+    for name in ("processes", "cpus_per_run"):
+        value = getattr(options, name)
+        if value is not None and not 1 <= value <= 1024:
+            raise invalid(name, value, "a whole number from 1 to 1,024")
     if not 0 <= options.gpus_per_run <= 64:
         raise invalid("gpus_per_run", options.gpus_per_run, "from 0 to 64")
-    if options.launcher == "ray":
-        on_ray.check(options.address)
-    if options.launcher == "slurm":
-        on_slurm.check(options.slurm, options.gpus_per_run)
+    if options.launcher in CHECKS:
+        CHECKS[options.launcher](options)
     return lambda jobs: found(jobs, options)

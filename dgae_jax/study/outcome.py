@@ -1,120 +1,111 @@
-"""What comes of a tuning: a line for each trial, the best settings, a table, a page."""
+"""The outcome of a tuning: best.json, trials.csv, tuning.html and a printed table."""
 
+import base64
 import csv
 import io
-from typing import Any
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
-import optuna
+import jinja2
+import optuna.visualization.matplotlib as plots
+from matplotlib import pyplot
+from optuna.study import Study
 from optuna.trial import FrozenTrial, TrialState
 
 from dgae_jax.configs.serial import to_dict
 from dgae_jax.run import files, terminal
-from dgae_jax.study.trials import finished
-from dgae_jax.study.tuning import Tuning
+from dgae_jax.run.options import engine_of
+from dgae_jax.study.search import FIRST_SEED, Tuning, shown
+
+FINISHED = (TrialState.COMPLETE, TrialState.PRUNED)
 
 TOP = 10
 """Trials that are printed."""
 
-WIDTH = 80
-"""Of what is printed [characters]."""
+_TEMPLATES = jinja2.Environment(
+    loader=jinja2.PackageLoader("dgae_jax.study"), autoescape=True, trim_blocks=True
+)
 
 
-class Progress:
-    """Says once of every trial that it finished, whoever trained it."""
+class Plot(NamedTuple):
+    """One of Optuna's plots."""
 
-    def __init__(self, study: optuna.Study):
-        self.study = study
-        self.said = {trial.number for trial in finished(study)}
-        if self.said:
-            terminal.say(f"going on after {len(self.said)} finished trials")
-
-    def show(self) -> None:
-        """A line for each trial that has finished since."""
-        new = [trial for trial in finished(self.study) if trial.number not in self.said]
-        for trial in sorted(new, key=lambda trial: (trial.datetime_complete, trial.number)):
-            self.said.add(trial.number)
-            best = ranked([t for t in finished(self.study) if t.number in self.said])[:1]
-            leader = f"; best {best[0].value:,.1f} of trial {best[0].number}" if best else ""
-            settings = ", ".join(f"{path} {_short(value)}" for path, value in trial.params.items())
-            terminal.say(f"trial {trial.number}: {_worth(trial)} ({settings}){leader}")
+    draw: Callable[..., Any]
+    least: int
+    """Different returns that it needs."""
 
 
-def ranked(trials: list[FrozenTrial]) -> list[FrozenTrial]:
-    """Those that got to their end, the best first."""
-    return sorted(
-        (t for t in trials if t.state == TrialState.COMPLETE), key=lambda t: (-_value(t), t.number)
-    )
+PLOTS = {
+    "Return of each trial, and the best so far": Plot(plots.plot_optimization_history, 1),
+    "Share of the spread that each setting explains": Plot(plots.plot_param_importances, 4),
+    "Return by setting": Plot(plots.plot_slice, 1),
+}
 
 
-def _value(trial: FrozenTrial) -> float:
-    assert trial.value is not None
-    return trial.value
+def settings_of(trial: FrozenTrial) -> dict[str, str]:
+    """Return the values of a trial as they are printed."""
+    return {
+        path: f"{value:.5g}" if isinstance(value, float) else str(value)
+        for path, value in trial.params.items()
+    }
 
 
-def _worth(trial: FrozenTrial) -> str:
-    if trial.state == TrialState.COMPLETE:
-        return f"return {trial.value:,.1f}"
-    return "pruned" + (f" at {trial.value:,.1f}" if trial.value is not None else "")
-
-
-def _short(value: Any) -> str:
-    return f"{value:.5g}" if isinstance(value, float) else str(value)
-
-
-def write(tuning: Tuning, study: optuna.Study) -> int:
-    """Write `best.json`, `trials.csv` and `tuning.html`, and print the best; 1 if no trial got to its end."""
-    from dgae_jax.study import tuning_page
-
-    trials = finished(study)
+def write(tuning: Tuning, study: Study) -> int:
+    """Write the files and print the best trials; return 1 if none was trained to its end."""
+    trials, best_file = study.get_trials(states=FINISHED), tuning.directory / "best.json"
     files.replace(tuning.directory / "trials.csv", _csv(tuning, trials))
-    best = ranked(trials)
+    complete = [trial for trial in trials if trial.state == TrialState.COMPLETE]
+    best = sorted(complete, key=lambda trial: (-(trial.value or 0.0), trial.number))
     if not best:
-        terminal.warn(
-            f"no trial got to its end: all {len(trials)} were pruned or broke down; see {tuning.directory}/worker-*.log"
-        )
+        log = f"{tuning.directory}/worker-*.log"
+        terminal.warn(f"all {len(trials)} trials were pruned or diverged; see {log}")
         return 1
-    files.write_json(tuning.directory / "best.json", to_dict(tuning.best(best[0].params)))
-    tuning_page.write(tuning, study, best)
-    terminal.say(table(tuning, best[:TOP]))
-    pruned = len(trials) - len(best)
-    terminal.say(
-        f"{len(trials)} trials, {pruned} of them pruned; all of them in {tuning.directory / 'trials.csv'}, plots in tuning.html"
+    files.write_json(best_file, to_dict(tuning.best_config(best[0].params)))
+    rows = [
+        [str(trial.number), f"{trial.value:,.1f}", *settings_of(trial).values()]
+        for trial in best[:TOP]
+    ]
+    head = ["trial", "return", *best[0].params]
+    returns = {trial.value for trial in best}
+    page = _TEMPLATES.get_template("tuning.html").render(
+        tuning=tuning,
+        first_seed=FIRST_SEED,
+        trials=len(trials),
+        search={path: shown(each) for path, each in tuning.space.items()},
+        engine=engine_of(tuning.config, tuning.options.eval_engine),
+        head=head,
+        rows=rows,
+        plots={title: _png(study, p.draw) for title, p in PLOTS.items() if len(returns) >= p.least},
+        best=best_file,
     )
-    terminal.say(
-        f"train with the best settings: dgae train --config {tuning.directory / 'best.json'}"
-    )
+    files.replace(tuning.directory / "tuning.html", page.encode())
+    widths = [max(map(len, column)) for column in zip(head, *rows, strict=True)]
+    for row in (head, *rows):
+        terminal.say("  ".join(map(str.rjust, row, widths)))
+    where = f"all of them in {tuning.directory / 'trials.csv'}, plots in tuning.html"
+    terminal.say(f"{len(trials)} trials, {len(trials) - len(best)} of them pruned; {where}")
+    terminal.say(f"train with the best settings: dgae train --config {best_file}")
     return 0
 
 
 def _csv(tuning: Tuning, trials: list[FrozenTrial]) -> bytes:
-    """All trials, in the order in which they were taken."""
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(["trial", "state", "return_mean", "seconds", *tuning.space])
     for trial in trials:
         seconds = trial.duration.total_seconds() if trial.duration else None
-        writer.writerow(
-            [
-                trial.number,
-                trial.state.name.lower(),
-                trial.value,
-                seconds,
-                *(trial.params.get(path) for path in tuning.space),
-            ]
-        )
+        values = (trial.params.get(path) for path in tuning.space)
+        writer.writerow([trial.number, trial.state.name.lower(), trial.value, seconds, *values])
     return text.getvalue().encode()
 
 
-def table(tuning: Tuning, trials: list[FrozenTrial]) -> str:
-    """Trials as aligned lines; where many settings are searched, the last ones do not fit."""
-    rows = [["trial", "return", *tuning.space]]
-    rows += [
-        [str(t.number), f"{_value(t):,.1f}", *(_short(t.params[path]) for path in tuning.space)]
-        for t in trials
-    ]
-    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    fit = sum(1 for i in range(len(widths)) if sum(widths[: i + 1]) + 2 * i <= WIDTH)
-    return "\n".join(
-        "  ".join(text.rjust(width) for text, width in zip(row[:fit], widths[:fit], strict=True))
-        for row in rows
-    )
+def _png(study: Study, draw: Callable[..., Any]) -> str:
+    """Return one of Optuna's plots as base64."""
+    image = io.BytesIO()
+    pyplot.switch_backend("agg")
+    with pyplot.style.context("default"):
+        axes = draw(study, target_name="mean return")
+        figure = (axes if hasattr(axes, "figure") else axes.flat[0]).figure
+        figure.savefig(image, format="png", dpi=120, bbox_inches="tight")
+        pyplot.close(figure)
+    return base64.b64encode(image.getvalue()).decode()

@@ -1,95 +1,197 @@
-"""The course of a study: what is done is skipped, what is not is launched, and what comes of it is written down at once."""
+"""The course of a sweep: launch the runs that are not done, show how far they are, keep results."""
 
 import contextlib
+import json
+import os
+import sys
 import time
+from collections import Counter
 from collections.abc import Sequence
-from typing import Any
+from typing import NamedTuple
 
 import jax
 import numpy as np
+from rich.console import Console, Group
+from rich.live import Live
+from rich.table import Table
 
 from dgae_jax.run import terminal
 from dgae_jax.run.options import RunOptions
 from dgae_jax.run.runtime import Signals
 from dgae_jax.study import results
 from dgae_jax.study.launch import Launch, Task
-from dgae_jax.study.matrix import Cell, Study
-from dgae_jax.study.view import View
-from dgae_jax.study.work import Job
+from dgae_jax.study.sweep import RunSpec, Sweep
+from dgae_jax.study.worker import Job
 
-LOOK_EVERY = 0.5
-"""Seconds between looks at the tasks."""
+POLL = 0.5
+"""Time between looks at the tasks [s]."""
+
+PLAIN_EVERY = 30.0
+"""Time between lines where there is no terminal [s]."""
+
+TAIL = 16_384
+"""Bytes at the end of a metrics file that hold its last row."""
 
 
-def reproduce(study: Study, cells: Sequence[Cell], options: RunOptions, launch: Launch) -> int:
-    """Train the cells that are not done, and keep `results.jsonl` up to date.
+def reproduce(sweep: Sweep, runs: Sequence[RunSpec], options: RunOptions, launch: Launch) -> int:
+    """Train the runs that are not done, and keep `results.jsonl` up to date.
 
-    0 all are done; 1 some failed; 128 + the signal if one came: the same call goes on. Raises ConfigError if the launcher cannot start.
+    Args:
+        sweep: the sweep, which nobody else has open.
+        runs: those of its runs that are asked for.
+        options: options of every run.
+        launch: the launcher.
+
+    Returns:
+        The exit code: 0 all are done, 1 some failed, 128 + a signal that came.
+
+    Raises:
+        ConfigError: the launcher cannot start.
     """
-    jax.config.update(
-        "jax_platforms", "cpu"
-    )  # accelerators are the cells': what is read here is small
-    rows = results.of_study(study)
-    results.write(study, rows)
-    jobs = [Job(study, cell, options) for cell in cells if cell.name not in rows]
-    terminal.say(
-        f"{study.path}: {len(cells) - len(jobs)} of {len(cells)} cells are done"
-        + (f", {len(jobs)} to train" if jobs else "")
-    )
-    failed = []
+    jax.config.update("jax_platforms", "cpu")  # accelerators are left to the runs
+    rows = results.read(sweep)
+    results.write(sweep, rows)
+    jobs = [Job(sweep, run, options) for run in runs if run.name not in rows]
+    left = f", {len(jobs)} to train" if jobs else ""
+    terminal.say(f"{sweep.path}: {len(runs) - len(jobs)} of {len(runs)} runs are done{left}")
     with (
         Signals() as signals,
-        View(study, [job.cell for job in jobs]) as view,
+        Progress(sweep, [job.run for job in jobs]) as progress,
         launch(jobs) if jobs else contextlib.nullcontext({}) as tasks,
     ):
         waiting = dict(tasks)
         while waiting and not signals.received:
             for task in [task for task in waiting if task.done()]:
-                cell = waiting.pop(task).cell
-                if reason := _failure(study, cell, task):
-                    failed.append(cell.name)
-                    view.note(cell, "failed", f"{cell.name}: {reason}")
+                run = waiting.pop(task).run
+                if reason := _failure(sweep, run, task):
+                    progress.note(run, "failed", f"{run.name}: {reason}")
                     continue
-                rows[cell.name] = results.rows_of(study, cell)
-                results.write(study, rows)
-                view.note(cell, "done", *_done(cell, rows[cell.name]))
-            view.look()
-            time.sleep(LOOK_EVERY)
+                rows[run.name] = results.rows_of(sweep, run)
+                results.write(sweep, rows)
+                progress.note(run, "done", _summary(run, rows[run.name]))
+            progress.show()
+            time.sleep(POLL)
         if waiting:
-            terminal.say(f"stopping {len(waiting)} cells")
+            terminal.say(f"stopping {len(waiting)} runs")
     if signals.received:
-        terminal.say(f"stopped by {signals.name}; the same command goes on")
+        terminal.say(f"stopped by {signals.name}; the same command continues")
         return signals.exit_code
+    failed = [name for name, state in progress.state.items() if state == "failed"]
     for name in failed:
-        terminal.warn(f"failed: {name}, see {study.path / 'logs' / name}.log")
+        terminal.warn(f"failed: {name}, see {sweep.path / 'logs' / name}.log")
     return 1 if failed else 0
 
 
-def _failure(study: Study, cell: Cell, task: Task) -> str | None:
-    """Why a cell has no result, by the last line that it said."""
+def _failure(sweep: Sweep, run: RunSpec, task: Task) -> str | None:
+    """Return why a run has no result, by the last line of its log."""
     try:
         code = task.result()
     except Exception as reason:  # of whatever kind the launcher's library raises
         return f"{type(reason).__name__}: {str(reason).partition(chr(10))[0][:200]}"
-    if code == 0 and results.is_done(study, cell):
+    if code == 0 and results.is_done(sweep, run):
         return None
-    lines = (
-        study.log(cell).read_text(errors="replace").split("\n") if study.log(cell).is_file() else []
-    )
-    last = next((line for line in reversed(lines) if line.strip()), "it said nothing")
-    return f"ended with exit code {code}: {last.strip()[:300]}"
+    log = sweep.log(run)
+    lines = log.read_text(errors="replace").strip().splitlines() if log.is_file() else []
+    return f"ended with exit code {code}: {lines[-1][:300] if lines else 'no output'}"
 
 
-def _done(cell: Cell, rows: list[dict[str, Any]]) -> tuple[str, float]:
-    """A line about a cell that is done, and its mean return."""
-    means = [row["final"]["return_mean"] for row in rows]
-    spread = (
-        f" ± {rows[0]['final']['return_std']:,.1f}"
-        if len(rows) == 1
-        else f", mean of {len(rows)} seeds"
-    )
-    mean = float(np.mean([np.nan if x is None else x for x in means]))
-    return (
-        f"{cell.name}: return {mean:,.1f}{spread}, {rows[0]['samples_per_second']:,.0f} steps/s",
-        mean,
-    )
+def _summary(run: RunSpec, rows: results.Rows) -> str:
+    std = rows[0]["final"]["return_std"] or 0.0
+    spread = f" ± {std:,.1f}" if len(rows) == 1 else f", mean of {len(rows)} seeds"
+    speed = f"{rows[0]['samples_per_second']:,.0f} steps/s"
+    return f"{run.name}: return {results.mean_return(rows):,.1f}{spread}, {speed}"
+
+
+class Reached(NamedTuple):
+    """How far a run is."""
+
+    steps: int
+    episode_return: float | None
+
+
+def reached(sweep: Sweep, run: RunSpec) -> Reached:
+    """Read the last whole row of the metrics of a run."""
+    try:
+        with (sweep.run_dir(run) / "metrics.jsonl").open("rb") as file:
+            file.seek(max(0, file.seek(0, os.SEEK_END) - TAIL))
+            last = json.loads(file.read().rpartition(b"\n")[0].rpartition(b"\n")[2])
+        return Reached(int(last["steps"]), last["episode_return"])
+    except (OSError, ValueError, LookupError, TypeError):
+        return Reached(0, None)
+
+
+class Progress:
+    """Shows how far the runs are: a table on a terminal, lines elsewhere."""
+
+    def __init__(self, sweep: Sweep, runs: Sequence[RunSpec]):
+        self.sweep, self.runs = sweep, runs
+        self.state = {run.name: "waiting" for run in runs}
+        self.start = {run.name: reached(sweep, run).steps for run in runs}
+        self.began = self.printed = time.monotonic()
+        console = Console(file=terminal.Steady(sys.stdout))
+        self.live = Live(console=console, auto_refresh=False) if terminal.is_live() else None
+
+    def __enter__(self) -> "Progress":
+        if self.live:
+            self.live.start()
+        return self
+
+    def __exit__(self, *_) -> None:
+        self.show()
+        if self.live:
+            self.live.stop()
+
+    def note(self, run: RunSpec, state: str, text: str) -> None:
+        """Note that a run is done or has failed, and print a line about it."""
+        self.state[run.name] = state
+        if self.live:
+            self.live.console.print(text, markup=False, highlight=False)
+        else:
+            terminal.say(text)
+
+    def show(self) -> None:
+        """Read what the runs have written, and show it."""
+        if not self.live and time.monotonic() - self.printed < PLAIN_EVERY:
+            return
+        far = {run.name: reached(self.sweep, run) for run in self.runs}
+        for name, state in self.state.items():
+            if state == "waiting" and far[name].steps > self.start[name]:
+                self.state[name] = "running"
+        if self.live:
+            self.live.update(Group(self._line(far), self._table(far)), refresh=True)
+        else:
+            self.printed = time.monotonic()
+            terminal.say(self._line(far))
+
+    def _line(self, far: dict[str, Reached]) -> str:
+        count = Counter(self.state.values())
+        states = [s for s in ("done", "running", "waiting", "failed") if count[s]]
+        ours = [run for run in self.runs if self.state[run.name] != "failed"]
+        total = sum(_steps(run) * run.config.num_seeds for run in ours)
+        there = sum(far[run.name].steps * run.config.num_seeds for run in ours)
+        made = there - sum(self.start[run.name] * run.config.num_seeds for run in ours)
+        left = (total - there) * (time.monotonic() - self.began) / made if made else None
+        eta = "time left unknown" if left is None else f"about {terminal.clock(left)} left"
+        counts = ", ".join(f"{count[s]} {s}" for s in states)
+        return f"{counts} of {len(self.runs)} runs; {there:,} of {total:,} steps, {eta}"
+
+    def _table(self, far: dict[str, Reached]) -> Table:
+        table = Table(box=None, pad_edge=False)
+        for name in ("env", "algorithm", "done", "running", "failed", "steps", "return"):
+            table.add_column(name, justify="left" if name in ("env", "algorithm") else "right")
+        groups: dict[tuple[str, str], list[RunSpec]] = {}
+        for run in self.runs:
+            groups.setdefault((run.config.env, run.label), []).append(run)
+        for names, runs in groups.items():
+            states = Counter(self.state[run.name] for run in runs)
+            share = np.mean([far[run.name].steps / _steps(run) for run in runs])
+            returns = [far[run.name].episode_return for run in runs]
+            known = [x for x in returns if x is not None]
+            counts = [str(states[state] or "") for state in ("done", "running", "failed")]
+            mean = f"{np.mean(known):,.0f}" if known else "–"
+            table.add_row(*names, *counts, f"{share:.0%}", mean)
+        return table
+
+
+def _steps(run: RunSpec) -> int:
+    return run.config.iterations * run.config.samples_per_iteration

@@ -1,23 +1,29 @@
-"""What a tuning searches: settings, and the values that each may have. Nothing here imports JAX or Optuna.
+"""What a tuning searches: settings, and the values of each as an Optuna distribution.
 
-`gamma=0.95:0.999` is a range, `policy.learning_rate=log:1e-4:1e-2` one whose logarithm is searched evenly, `num_envs=int:4:64` (or
-`int:log:4:64`) one of whole numbers, `critic.minibatches=16,32,64` a choice.
+`gamma=0.95:0.999` is a range, `policy.learning_rate=log:1e-4:1e-2` one on a logarithmic scale,
+`num_envs=int:4:64` (or `int:log:4:64`) one of whole numbers and `critic.minibatches=16,32,64` a
+choice. Widths of layers are written `64x64`. Nothing here imports JAX.
 """
 
 import dataclasses
-import math
-from collections.abc import Sequence
+import re
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from types import UnionType
-from typing import Any, get_args, get_origin, get_type_hints
+from pathlib import Path
+from typing import Any
 
-from dgae_jax.configs.config import ConfigError, CriticConfig, PolicyConfig, floats_of, invalid
+from optuna.distributions import CategoricalDistribution, FloatDistribution, IntDistribution
+
+from dgae_jax.configs.config import ConfigError, invalid
 from dgae_jax.configs.resolved import ResolvedConfig, resolve
+from dgae_jax.run.options import RunOptions
 
-USUAL = ("gamma=0.95:0.9999", "lam=0.5:1")
-"""What the paper tuned for each method."""
+Distribution = FloatDistribution | IntDistribution | CategoricalDistribution
 
-SAME_FOR_ALL = (
+Space = dict[str, Distribution]
+"""The values of each setting, by its dotted path."""
+
+FIXED = (
     "env",
     "env_version",
     "algo",
@@ -27,210 +33,149 @@ SAME_FOR_ALL = (
     "total_steps",
     "episode_length",
 )
-"""What the trials of a tuning share, since it says what is measured."""
+"""Settings that all trials share, because they say what is measured."""
 
-LISTED = 1000
-"""Ranges of as many whole numbers are looked at number by number."""
+FIRST_SEED = 1000
+"""First seed of the trials; reports use 0, 1, …, which no choice of settings has seen."""
 
-
-@dataclass(frozen=True)
-class Range:
-    """Numbers from `low` to `high`, both of them too."""
-
-    low: float
-    high: float
-    log: bool = False
-    whole: bool = False
-
-    def __contains__(self, value: Any) -> bool:
-        return value is not None and self.low <= value <= self.high
-
-    def __str__(self) -> str:
-        return f"{'int:' * self.whole}{'log:' * self.log}{self.low:g}:{self.high:g}"
-
-    @property
-    def examples(self) -> Sequence[Any]:
-        """Values that must be valid for all of them to be."""
-        few = self.whole and self.high - self.low < LISTED
-        return range(int(self.low), int(self.high) + 1) if few else (self.low, self.high)
+MAX_LISTED = 1000
+"""Ranges of fewer whole numbers are checked number by number."""
 
 
 @dataclass(frozen=True)
-class Choice:
-    """One of several values; widths of layers are written `64x64`."""
+class Tuning:
+    """One tuning, as every process that works on it knows it."""
 
-    values: tuple[Any, ...]
+    config: ResolvedConfig
+    """Settings that are not searched; its values of those that are make the first trial."""
+    space: Space
+    directory: Path
+    options: RunOptions = dataclasses.field(default_factory=RunOptions)
+    """Options of the trials' runs."""
+    storage: str | None = None
+    """URL of a PostgreSQL database; None for SQLite in the directory."""
+    trials: int = 50
+    """Trials to finish, by all processes together."""
+    seeds: int = 2
+    """Seeds that each trial trains."""
+    workers: int = 1
+    """Processes on this machine."""
+    sampler_seed: int = 0
+    heartbeat: int = 20
+    """Time between heartbeats; a trial without one for three times as long is retried [s]."""
 
-    def __contains__(self, value: Any) -> bool:
-        return value in self.values
+    def trial_config(self, values: Mapping[str, Any]) -> ResolvedConfig:
+        """Return the configuration of a trial; raise ConfigError if its values are invalid."""
+        seeds = {"seed": FIRST_SEED, "num_seeds": self.seeds}
+        return with_values(self.config, {**values, **seeds})
 
-    def __str__(self) -> str:
-        return ",".join(map(str, self.values))
+    def best_config(self, values: Mapping[str, Any]) -> ResolvedConfig:
+        """Return the configuration to train with the values of the best trial."""
+        return with_values(self.config, {**values, "seed": 0, "num_seeds": 1})
 
-    @property
-    def examples(self) -> Sequence[Any]:
-        """All of them."""
-        return self.values
-
-
-Space = dict[str, Range | Choice]
-"""By the path of each setting."""
+    def start_values(self) -> dict[str, Any] | None:
+        """Return the configuration's own values; None if one of them is outside the space."""
+        values = values_of(self.config, self.space)
+        return values if all(_holds(self.space[path], values[path]) for path in values) else None
 
 
 def space_of(words: Sequence[str], config: ResolvedConfig) -> Space:
-    """What `words` say, checked against the rest of `config`.
+    """Parse what is to be searched, and check it against the rest of the configuration.
 
-    Raises ConfigError for an unknown setting, one that the algorithm does not use, a malformed range and values that are invalid.
+    Args:
+        words: `SETTING=VALUES`, as in the docstring of this module.
+        config: the configuration whose settings are searched.
+
+    Raises:
+        ConfigError: a setting is unknown, fixed or has no effect, or a value is invalid.
     """
     space: Space = {}
     for word in words:
-        path, dimension = _dimension(word)
+        name, _, text = word.partition("=")
+        path = name.replace("-", "_")
+        if path in FIXED:
+            raise invalid("search", word, f"of another setting: all trials share {path}")
         if path in space:
             raise invalid("search", word, f"the only range of {path}")
-        for value in dimension.examples:
+        try:
+            space[path] = _distribution(text)
+        except ValueError:
+            forms = "LOW:HIGH, log:LOW:HIGH, int:LOW:HIGH, int:log:LOW:HIGH or VALUE,VALUE"
+            raise invalid("search", word, f"SETTING={forms}, with LOW below HIGH") from None
+        for value in _examples(space[path]):
             try:
-                resolve(with_values(config, {path: value}))
+                with_values(config, {path: value})
             except ConfigError as reason:
                 raise invalid("search", word, f"valid throughout ({reason})") from None
-        space[path] = dimension
     return space
 
 
-def with_values(config: ResolvedConfig, values: dict[str, Any]) -> ResolvedConfig:
-    """The configuration with some settings, by path, replaced."""
-    for path, value in values.items():
-        layers = isinstance(value, str) and _is_layers(_kinds(ResolvedConfig)[path])
-        config = _replaced(
-            config, path.split("."), tuple(map(int, value.split("x"))) if layers else value
-        )
-    return config
+def with_values(config: ResolvedConfig, values: Mapping[str, Any]) -> ResolvedConfig:
+    """Return the configuration with some settings, by path, replaced and all checked again."""
+    settings = {path: _setting(path, value) for path, value in values.items()}
+    return resolve(config.as_config().replace(**settings))
 
 
 def values_of(config: ResolvedConfig, space: Space) -> dict[str, Any]:
-    """What the configuration has of what is searched, as a trial writes it."""
-    values = {}
-    for path in space:
-        value: Any = config
-        for name in path.split("."):
-            value = getattr(value, name)
-        values[path] = "x".join(map(str, value)) if isinstance(value, tuple) else value
-    return values
+    """Return the values of the searched settings, as a trial keeps them."""
+    values = {path: config.as_config().get(path) for path in space}
+    return {
+        path: "x".join(map(str, value)) if isinstance(value, tuple) else value
+        for path, value in values.items()
+    }
 
 
-def is_traced(path: str) -> bool:
-    """Whether one compiled program serves all values of a setting."""
-    part, _, name = path.rpartition(".")
-    cls = {"": ResolvedConfig, "policy": PolicyConfig, "critic": CriticConfig}.get(part)
-    return cls is not None and name in floats_of(cls)
+def shown(distribution: Distribution) -> str:
+    """Return a distribution as it is written on the command line."""
+    if isinstance(distribution, CategoricalDistribution):
+        return ",".join(map(str, distribution.choices))
+    kind = "int:" if isinstance(distribution, IntDistribution) else ""
+    scale = "log:" if distribution.log else ""
+    return f"{kind}{scale}{distribution.low:g}:{distribution.high:g}"
 
 
-def _replaced(settings: Any, path: list[str], value: Any) -> Any:
-    name, *rest = path
-    return dataclasses.replace(
-        settings, **{name: _replaced(getattr(settings, name), rest, value) if rest else value}
-    )
-
-
-def _kinds(cls: type, prefix: str = "") -> dict[str, Any]:
-    """The type of every setting, by path."""
-    kinds: dict[str, Any] = {}
-    for name, kind in get_type_hints(cls).items():
-        bare = get_args(kind)[0] if isinstance(kind, UnionType) else kind
-        parts = isinstance(bare, type) and dataclasses.is_dataclass(bare)
-        kinds |= _kinds(bare, f"{prefix}{name}.") if parts else {prefix + name: bare}
-    return kinds
-
-
-def _is_layers(kind: Any) -> bool:
-    return get_origin(kind) is tuple
-
-
-def _dimension(word: str) -> tuple[str, Range | Choice]:
-    name, equals, text = word.partition("=")
-    path, kinds = (
-        name.replace("-", "_"),
-        {path: kind for path, kind in _kinds(ResolvedConfig).items() if path not in SAME_FOR_ALL},
-    )
-    if not (equals and text):
-        raise invalid(
-            "search",
-            word,
-            "SETTING=LOW:HIGH, =log:LOW:HIGH, =int:LOW:HIGH, =int:log:LOW:HIGH or =VALUE,VALUE",
-        )
-    if path in SAME_FOR_ALL:
-        raise invalid("search", word, f"of another setting: all trials have the same {path}")
-    if path not in kinds:
-        raise invalid("search", word, f"of one of {', '.join(kinds)}")
-    return path, (_range if ":" in text else _choice)(word, text, kinds[path])
-
-
-def _range(word: str, text: str, kind: Any) -> Range:
-    *how, low, high = text.split(":")
-    if tuple(how) not in ((), ("log",), ("int",), ("int", "log")) or kind not in (int, float):
-        raise invalid(
-            "search",
-            word,
-            "LOW:HIGH, log:LOW:HIGH, int:LOW:HIGH or int:log:LOW:HIGH of a setting that is a number",
-        )
-    if ("int" in how) != (kind is int):
-        raise invalid(
-            "search",
-            word,
-            "int:LOW:HIGH, its values are whole"
-            if kind is int
-            else "without int:, its values are not whole",
-        )
-    try:
-        found = Range(_number(low, kind), _number(high, kind), "log" in how, kind is int)
-    except ValueError:
-        raise invalid(
-            "search", word, f"between {'whole numbers' if kind is int else 'numbers'}, LOW:HIGH"
-        ) from None
-    if not found.low < found.high:
-        raise invalid("search", word, "LOW:HIGH with LOW below HIGH")
-    if found.log and found.low <= 0:
-        raise invalid("search", word, "above 0, for the sake of its logarithm")
-    return found
-
-
-def _choice(word: str, text: str, kind: Any) -> Choice:
-    try:
-        values = tuple(_value(each, kind) for each in text.split(","))
-    except ValueError:
-        raise invalid(
-            "search",
-            word,
-            f"a list of {_NAMES.get(kind, 'widths of layers, 64x64')}, with commas between them",
-        ) from None
-    if len(set(values)) != len(values) or len(values) < 2:
-        raise invalid("search", word, "a list of two or more different values")
-    return Choice(values)
-
-
-_NAMES = {int: "whole numbers", float: "numbers", bool: "true and false", str: "names"}
-
-
-def _value(text: str, kind: Any) -> Any:
-    """A value as Optuna keeps it; raises ValueError."""
-    if _is_layers(kind):
-        return "x".join(str(int(width)) for width in text.split("x"))
-    if kind is bool:
-        return (
-            {"true": True, "false": False}[text.lower()]
-            if text.lower() in ("true", "false")
-            else _no_value(text)
-        )
-    if kind in (int, float):
-        return _number(text, kind)
-    return text or _no_value(text)
-
-
-def _no_value(text: str) -> Any:
-    raise ValueError(text)
-
-
-def _number(text: str, kind: type) -> float:
-    number = float(text)
-    if not math.isfinite(number) or (kind is int and not number.is_integer()):
+def _distribution(text: str) -> Distribution:
+    """Parse the part after `=`; raise ValueError."""
+    if found := re.fullmatch(r"(int:)?(log:)?([^:,]+):([^:,]+)", text):
+        whole, log, low, high = found.groups()
+        if not float(low) < float(high):
+            raise ValueError(text)
+        if whole:
+            return IntDistribution(int(low), int(high), log=bool(log))
+        return FloatDistribution(float(low), float(high), log=bool(log))
+    choices = [_value(each) for each in text.split(",")]
+    if len(set(choices)) != len(choices) or len(choices) < 2 or "" in choices:
         raise ValueError(text)
-    return kind(number)
+    return CategoricalDistribution(choices)
+
+
+def _value(text: str) -> Any:
+    if text.lower() in ("true", "false"):
+        return text.lower() == "true"
+    for kind in (int, float):
+        try:
+            return kind(text)
+        except ValueError:
+            continue
+    return text
+
+
+def _setting(path: str, value: Any) -> Any:
+    is_layers = path.endswith(".hidden") and re.fullmatch(r"\d+(x\d+)*", str(value))
+    return tuple(map(int, str(value).split("x"))) if is_layers else value
+
+
+def _examples(distribution: Distribution) -> Sequence[Any]:
+    """Return values that must be valid for all of them to be."""
+    if isinstance(distribution, CategoricalDistribution):
+        return distribution.choices
+    low, high = distribution.low, distribution.high
+    if isinstance(distribution, IntDistribution) and high - low < MAX_LISTED:
+        return range(distribution.low, distribution.high + 1)
+    return low, high
+
+
+def _holds(distribution: Distribution, value: Any) -> bool:
+    if isinstance(distribution, CategoricalDistribution):
+        return value in distribution.choices
+    return distribution.low <= value <= distribution.high

@@ -1,57 +1,69 @@
-"""Questions for a study: tables of variants, each an algorithm and the flags in which it departs from its preset."""
+"""Questions of a sweep: for each a table of variants, as an algorithm and changed settings."""
 
-SCALAR = {
-    "scalar": "ppo",
-    "scalar-one-step": "ppo --critic.target bellman",
-    "huber": "dppo --critic.quantiles 1 --critic.target lambda-return",
-    "huber-one-step": "dppo --critic.quantiles 1 --critic.target bellman",
+from typing import Any
+
+from dgae_jax.configs.validation import lookup
+
+Variant = tuple[str, dict[str, Any]]
+"""An algorithm, and the settings by path in which the variant departs from its preset."""
+
+SCALAR: dict[str, Variant] = {
+    "scalar": ("ppo", {}),
+    "scalar-one-step": ("ppo", {"critic.target": "bellman"}),
+    "huber": ("dppo", {"critic.quantiles": 1, "critic.target": "lambda-return"}),
+    "huber-one-step": ("dppo", {"critic.quantiles": 1, "critic.target": "bellman"}),
 }
-"""One value: half the squared error, or the Huber loss, which is what the quantile-Huber loss is for K = 1."""
+"""Critics of one value: squared error, or the Huber loss (quantile-Huber with K = 1)."""
 
-DISTRIBUTIONAL = {
-    "sr-lambda": "dppo",
-    "lambda-return": "dppo --critic.target lambda-return",
-    "lambda-shift": "dppo --critic.target lambda-shift",
-    "bellman": "dppo --critic.target bellman",
-    "bellman-frozen": "dppo --critic.target bellman-frozen",
-    "quantiles-1": "dppo --critic.quantiles 1",
-    "quantiles-8": "dppo --critic.quantiles 8",
-    "kappa-0.01": "dppo --critic.kappa 0.01",
-    "kappa-0.1": "dppo --critic.kappa 0.1",
-    "matched-scale": "dppo --critic.max-grad-norm 16",
+DISTRIBUTIONAL: dict[str, Variant] = {
+    "sr-lambda": ("dppo", {}),
+    "lambda-return": ("dppo", {"critic.target": "lambda-return"}),
+    "lambda-shift": ("dppo", {"critic.target": "lambda-shift"}),
+    "bellman": ("dppo", {"critic.target": "bellman"}),
+    "bellman-frozen": ("dppo", {"critic.target": "bellman-frozen"}),
+    "quantiles-1": ("dppo", {"critic.quantiles": 1}),
+    "quantiles-8": ("dppo", {"critic.quantiles": 8}),
+    "kappa-0.01": ("dppo", {"critic.kappa": 0.01}),
+    "kappa-0.1": ("dppo", {"critic.kappa": 0.1}),
+    # 64 quantiles weigh the loss 32 times as much, which Adam does not see but max_grad_norm does
+    "matched-scale": ("dppo", {"critic.max_grad_norm": 16.0}),
 }
-"""A distribution. The loss of 64 quantiles is a sum with weights of ½ on average, 32 times the scalar one; Adam does not see the
-scale of a loss, but the bound of the gradient's norm, 0.5, does: 32 · 0.5 = 16 bounds both alike."""
 
-_MONTE_CARLO = "dppo --critic.target monte-carlo --critic.kappa 0.01 --critic.epochs 3"
+MONTE_CARLO = {"critic.target": "monte-carlo", "critic.kappa": 0.01, "critic.epochs": 3}
 
-CALIBRATED = {
-    "monte-carlo-64": f"{_MONTE_CARLO} --num-envs 32 --num-steps 64",
-    "monte-carlo-128": f"{_MONTE_CARLO} --num-envs 16 --num-steps 128",
+CALIBRATION: dict[str, Variant] = {
+    "monte-carlo-64": ("dppo", {**MONTE_CARLO, "num_envs": 32, "num_steps": 64}),
+    "monte-carlo-128": ("dppo", {**MONTE_CARLO, "num_envs": 16, "num_steps": 128}),
 }
-"""A critic that is told how the return went on, by rollouts of 64 and 128 steps."""
+"""Critics fitted to Monte Carlo returns, with rollouts of 64 and 128 steps."""
 
-NOISE = "--noise.reward 0.5 --noise.action 0.1"
-"""Of rewards around 3 and actions within ±1."""
+NOISE = {"noise.reward": 0.5, "noise.action": 0.1}
+"""Rewards are around 3, actions within ±1."""
 
-
-def _noisy(variants: dict[str, str]) -> dict[str, str]:
-    return {f"{name}+noise": f"{words} {NOISE}" for name, words in variants.items()}
-
-
-def _preferences() -> dict[str, str]:
-    return {
-        f"{metric.replace(':', '-')}-lambda-{lam}+noise": f"dppo --metric {metric} --gae-lambda {lam} {NOISE}"
-        for metric in ("mean", "cvar:0.25")
-        for lam in (0.0, 0.5, 0.95, 1.0)
-    }
+RISK: dict[str, Variant] = {
+    f"{metric.replace(':', '-')}-lambda-{gae_lambda}": (
+        "dppo",
+        {"metric": metric, "gae_lambda": gae_lambda},
+    )
+    for metric in ("mean", "cvar:0.25")
+    for gae_lambda in (0.0, 0.5, 0.95, 1.0)
+}
 
 
-VARIANTS: dict[str, dict[str, str]] = {
+def _noisy(table: dict[str, Variant]) -> dict[str, Variant]:
+    return {f"{name}+noise": (algo, {**values, **NOISE}) for name, (algo, values) in table.items()}
+
+
+VARIANTS: dict[str, dict[str, Variant]] = {
     "attribution": {**SCALAR, **DISTRIBUTIONAL},
     "attribution-noise": _noisy({**SCALAR, **DISTRIBUTIONAL}),
-    "calibration": CALIBRATED,
-    "risk": _preferences(),
+    "calibration": CALIBRATION,
+    "risk": _noisy(RISK),
 }
-"""What the gain of distributional critics is made of, with and without noise on the task; what makes their distributions hold; what a
-preference for safe returns buys."""
+"""By question: what the gain of distributional critics comes from, without and with noise on the
+task; what makes their distributions calibrated; what a risk-averse metric costs and gains."""
+
+
+def variants(question: str) -> dict[str, Variant]:
+    """Return the variants of a question by name; raise ConfigError for an unknown question."""
+    return lookup("variants", question, VARIANTS)

@@ -1,97 +1,109 @@
-"""One process of a tuning: it takes trials, trains them and tells what they are worth, until enough are finished."""
+"""The process of one run of a sweep: python -m dgae_jax.study.worker SWEEP NAME OPTIONS [CORE …]
 
+It ends with the exit code of the run. It stops, with a checkpoint, when its standard input ends,
+because then the process that started it is gone.
+"""
+
+import dataclasses
+import json
 import os
+import signal
+import subprocess
 import sys
+import threading
 import time
-
-import optuna
-from optuna.storages import RDBStorage
-from optuna.trial import Trial, TrialState
+from collections.abc import Sequence
+from pathlib import Path
+from typing import NamedTuple
 
 from dgae_jax.configs.config import ConfigError
-from dgae_jax.run import runtime, terminal
-from dgae_jax.run.runtime import Signals, Stopped
-from dgae_jax.run.training import RunError
-from dgae_jax.study import alone, side_by_side
-from dgae_jax.study.storage import alive, open_storage, open_study, requeue, unwarned
-from dgae_jax.study.trials import is_over, take
-from dgae_jax.study.tuning import Tuning
+from dgae_jax.run import terminal
+from dgae_jax.run.directory import InUseError
+from dgae_jax.run.options import RunOptions, read_options, saved_options
+from dgae_jax.study import sweep as sweeps
+from dgae_jax.study.sweep import RunSpec, Sweep
 
-POLL = 0.5
-"""Time between looks at trials that others are at work on [s]."""
+IN_USE_TIMEOUT = 300.0
+"""Longest wait for another process of the same run, which is about to stop [s]."""
 
 
-def serve(tuning: Tuning, worker: int) -> int:
-    """Work on a tuning: 0 when it is over, 130 / 143 when it was stopped, 1 when it cannot go on."""
-    try:
-        if tuning.side_by_side == 1:
-            alone.ready(tuning)
-        storage = open_storage(tuning)
-        code = _serve(tuning, open_study(tuning, storage, worker), storage)
-    except (ConfigError, RunError) as reason:
-        terminal.warn(f"stopped: {reason}")
-        code = 1
-    if runtime.is_compiling():  # Python would wait for it
-        sys.stdout.flush()
-        os._exit(code)
-    return code
+class Job(NamedTuple):
+    """A run of a sweep and how to train it."""
+
+    sweep: Sweep
+    run: RunSpec
+    options: RunOptions
 
 
-def _serve(tuning: Tuning, study: optuna.Study, storage: RDBStorage) -> int:
-    with Signals() as signals:
-        while not (signals.received or is_over(study, tuning)):
-            taken = take(study, tuning)
-            if not taken:
-                time.sleep(POLL)
+def execute(job: Job, cores: Sequence[int] = (), lifeline: int = subprocess.PIPE) -> int:
+    """Train a run in a process of its own, which writes to the run's log.
+
+    Args:
+        job: the run.
+        cores: CPU cores of the process; empty for all.
+        lifeline: its standard input. When the other end is closed the run stops.
+
+    Returns:
+        The exit code of the run.
+    """
+    options = saved_options(job.options)
+    options |= {"cache_dir": job.options.cache_dir, "inexact": job.options.inexact}
+    words = [str(job.sweep.path.absolute()), job.run.name, json.dumps(options), *map(str, cores)]
+    with job.sweep.log(job.run).open("ab") as log:
+        process = subprocess.Popen(
+            [sys.executable, "-m", __name__, *words],
+            stdin=lifeline,
+            stdout=log,
+            stderr=log,
+            start_new_session=True,  # Ctrl-C reaches the launcher only, which stops its runs
+        )
+    with process:
+        return process.wait()
+
+
+def main() -> int:
+    """Continue or start the run."""
+    terminal.prepare()
+    path, name, options, *cores = sys.argv[1:]
+    if cores:
+        os.sched_setaffinity(0, map(int, cores))
+    threading.Thread(target=_stop_when_abandoned, daemon=True).start()
+    sweep, chosen = sweeps.read(Path(path)), json.loads(options)
+    run = next(each for each in sweep.runs if each.name == name)
+    return _train(
+        run,
+        dataclasses.replace(
+            read_options(chosen),
+            run_dir=sweep.run_dir(run),
+            resume_or_start=True,
+            num_processes=1,
+            cache_dir=chosen["cache_dir"],
+            inexact=chosen["inexact"],
+        ),
+    )
+
+
+def _stop_when_abandoned() -> None:
+    while os.read(0, 1):
+        pass
+    os.kill(os.getpid(), signal.SIGTERM)
+
+
+def _train(run: RunSpec, options: RunOptions) -> int:
+    from dgae_jax.run import training  # after the cores are set
+
+    since = time.monotonic()
+    while True:
+        try:
+            return training.train_command(run.config, options)
+        except ConfigError as mistake:
+            waited = time.monotonic() - since
+            if isinstance(mistake, InUseError) and waited < IN_USE_TIMEOUT:
+                time.sleep(0.5)
                 continue
-            with alive(study, storage, taken, tuning.heartbeat):
-                code = (
-                    _together(tuning, study, taken, signals)
-                    if tuning.side_by_side > 1
-                    else _one(tuning, study, taken[0])
-                )
-            if code:
-                return code
-        return signals.exit_code if signals.received else 0
+            terminal.warn(f"error: {mistake}")
+            return 2
 
 
-def _one(tuning: Tuning, study: optuna.Study, trial: Trial) -> int:
-    """Train one trial and tell its value; the exit code if it was stopped, otherwise 0."""
-    terminal.say(f"trial {trial.number}: {trial.params}")
-    try:
-        with unwarned():
-            value = alone.train(tuning, study, trial)
-    except optuna.TrialPruned as reason:
-        terminal.say(f"trial {trial.number} pruned: {reason}")
-        study.tell(trial, state=TrialState.PRUNED, skip_if_finished=True)
-    except optuna.exceptions.UpdateFinishedTrialError:
-        terminal.say(f"trial {trial.number} was taken over by another process")
-    except RunError as end:
-        requeue(study, trial)
-        terminal.say(str(end))
-        return end.exit_code
-    except BaseException:
-        study.tell(trial, state=TrialState.FAIL, skip_if_finished=True)
-        raise
-    else:
-        study.tell(trial, value, skip_if_finished=True)
-    return 0
-
-
-def _together(tuning: Tuning, study: optuna.Study, trials: list[Trial], signals: Signals) -> int:
-    """As `_one`, for several trials in one program."""
-    try:
-        with unwarned():
-            values = side_by_side.train(tuning, study, trials, signals)
-    except Stopped:
-        for trial in trials:
-            requeue(study, trial)
-        return signals.exit_code
-    except BaseException:
-        for trial in trials:
-            study.tell(trial, state=TrialState.FAIL, skip_if_finished=True)
-        raise
-    for trial, value in zip(trials, values, strict=True):
-        state = TrialState.PRUNED if value is None else TrialState.COMPLETE
-        study.tell(trial, value, state, skip_if_finished=True)
-    return 0
+if __name__ == "__main__":
+    sys.exit(main())

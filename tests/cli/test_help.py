@@ -14,7 +14,7 @@ from dgae_jax.cli import main, reproduce, train, tune
 from dgae_jax.cli.arguments import parse
 from dgae_jax.cli.flags import leaves
 from dgae_jax.cli.main import COMMANDS
-from dgae_jax.study import matrix
+from dgae_jax.study import sweep
 from tests.helpers import ROOT
 
 MODULES = {name: import_module(f"dgae_jax.cli.{name}") for name in COMMANDS}
@@ -191,6 +191,6 @@ def test_in_ascii_there_is_not_a_box_nor_an_escape():
 )  # fmt: skip
 def test_a_mistake_is_one_line_in_our_words(argv, message, dgae, monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(matrix, "opened", None)
+    monkeypatch.setattr(sweep, "opened", None)
     assert dgae(*argv.split()) == (2, "", f"error: {message}\n")
     assert list(tmp_path.iterdir()) == []
