@@ -1,10 +1,12 @@
-"""Quality of predictions, and the uncertainty of a mean over seeds."""
+"""Quality of predicted distributions (JAX), and uncertainty over seeds (NumPy, on the host)."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from typing import Any
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Key
+import numpy as np
+from jaxtyping import Array, Float
 
 from dgae_jax.maths.transport import quantile_midpoints
 
@@ -12,9 +14,10 @@ from dgae_jax.maths.transport import quantile_midpoints
 def explained_variance(
     prediction: Float[Array, "*shape"], outcome: Float[Array, "*shape"]
 ) -> Float[Array, ""]:
-    """1 − Var[outcome − prediction] / Var[outcome]: 1 is perfect, 0 no better than a constant.
+    """Compute 1 − Var[outcome − prediction] / Var[outcome].
 
-    NaN where the outcome does not vary.
+    Returns:
+        1 for a perfect prediction, 0 for a constant one; NaN where the outcome does not vary.
     """
     variance = outcome.var()
     return jnp.where(
@@ -27,22 +30,31 @@ def explained_variance(
 def pit(
     quantiles: Float[Array, "*batch K"], outcome: Float[Array, "*batch"]
 ) -> Float[Array, "*batch"]:
-    """Probability integral transform: the share of quantiles at or below the outcome, uniform for a calibrated critic."""
+    """Compute the probability integral transform: the share of quantiles at or below the outcome.
+
+    It is uniform for a calibrated critic.
+    """
     return (quantiles <= outcome[..., None]).mean(-1)
 
 
 def coverage(
     quantiles: Float[Array, "*batch K"], outcome: Float[Array, "*batch"], level: float = 0.9
 ) -> Float[Array, ""]:
-    """Share of outcomes inside the central interval that should hold `level` of them; K quantiles give levels up to 1 − 1/K.
+    """Compute the share of outcomes inside the central interval that should hold `level` of them.
 
-    NaN for higher levels, 0.9 with K < 10: the ends of the interval, F⁻¹((1 ± level)/2), then lie outside the midpoints 1/2K …
-    1 − 1/2K. Ending it at the outermost ones would hold only 1 − 1/K of the outcomes of a calibrated critic, and an
-    extrapolation would assume a shape of the tails.
+    Args:
+        quantiles: Values at the midpoints 1/2K … 1 − 1/2K, in any order.
+        outcome: Observed values.
+        level: Nominal share, in (0, 1). K quantiles give levels up to 1 − 1/K.
+
+    Returns:
+        The share; NaN for levels above 1 − 1/K (0.9 with K < 10). The ends of such an interval lie
+        outside the midpoints, and an extrapolation would assume a shape of the tails.
+
+    Raises:
+        ValueError: `level` is outside (0, 1).
     """
-    if not 0 < level < 1:
-        raise ValueError(f"the level of an interval is {level}; it must lie between 0 and 1")
-    tail, k = (1 - level) / 2, quantiles.shape[-1]
+    tail, k = _tail(level), quantiles.shape[-1]
     if tail < (1 - 1e-9) / (2 * k):
         return jnp.full((), jnp.nan)
     grid, ordered = quantile_midpoints(k), jnp.sort(quantiles)
@@ -53,32 +65,76 @@ def coverage(
 def crps(
     quantiles: Float[Array, "*batch K"], outcome: Float[Array, "*batch"]
 ) -> Float[Array, "*batch"]:
-    """Continuous ranked probability score, 2 ∫ ρ_τ(y − F⁻¹(τ)) dτ with the pinball loss ρ at the midpoints; lower is better.
+    """Compute the continuous ranked probability score, 2 ∫ ρ_τ(y − F⁻¹(τ)) dτ; lower is better.
 
-    Quantiles are sorted first, because a network's may cross.
+    ρ is the pinball loss at the midpoints. Quantiles are sorted first, because a network's may
+    cross.
     """
     u = outcome[..., None] - jnp.sort(quantiles)
     tau = quantile_midpoints(quantiles.shape[-1])
     return 2 * (u * (tau - (u < 0))).mean(-1)
 
 
-def iqm(samples: Float[Array, " S"]) -> Float[Array, ""]:
-    """Interquartile mean: the mean without the lowest and the highest ⌊S/4⌋ samples (Agarwal et al. 2021)."""
-    cut = samples.shape[0] // 4
-    return jnp.sort(samples)[cut : samples.shape[0] - cut].mean()
+Samples = np.ndarray | jax.Array | Sequence[Any]
+"""Samples [..., S], or a list with the samples [..., S] of each stratum, of any size S."""
+
+
+def iqm(samples: Samples) -> np.ndarray | np.floating:
+    """Compute the interquartile mean (Agarwal et al. 2021, arXiv:2108.13264).
+
+    Args:
+        samples: [..., S], or a list with the samples [..., S] of each stratum, which are pooled.
+
+    Returns:
+        Mean [...] without the lowest and the highest ⌊S/4⌋ samples.
+    """
+    pooled = np.sort(np.concatenate(_strata(samples), axis=-1), axis=-1)
+    cut = pooled.shape[-1] // 4
+    return pooled[..., cut : pooled.shape[-1] - cut].mean(-1)
 
 
 def bootstrap_interval(
-    key: Key[Array, ""],
-    samples: Float[Array, " S"],
-    statistic: Callable[[Array], Array] = iqm,
+    samples: Samples,
+    statistic: Callable[[Any], Any] = iqm,
     *,
     level: float = 0.95,
-    resamples: int = 2_000,
-) -> Float[Array, "2"]:
-    """Percentile bootstrap interval (low, high) of a statistic of independent samples, one per seed."""
+    resamples: int = 10_000,
+    seed: int = 0,
+) -> np.ndarray:
+    """Compute the stratified percentile bootstrap interval of a statistic (Agarwal et al. 2021).
+
+    Args:
+        samples: Independent samples [S], one per seed, or a list with the samples of each stratum.
+            Strata keep their sizes: seeds are drawn within each task.
+        statistic: Function of the draws, which have the form of `samples` with a leading axis
+            [resamples]; it reduces the last axis.
+        level: Share of the statistic's draws inside the interval, in (0, 1).
+        resamples: Number of draws; 10,000 fix the ends to about a hundredth of the width.
+        seed: Seed of the draws: the same samples give the same interval.
+
+    Returns:
+        Lower and upper end [2, ...].
+
+    Raises:
+        ValueError: `level` is outside (0, 1).
+    """
+    tail = _tail(level)
+    generator, strata = np.random.default_rng(seed), _strata(samples)
+    draws = [x[generator.integers(len(x), size=(resamples, len(x)))] for x in strata]
+    # 1 − tail is not always the nearest number to (1 + level) / 2
+    ends = [tail, (1 + level) / 2]
+    return np.quantile(statistic(draws if _stratified(samples) else draws[0]), ends, axis=0)
+
+
+def _stratified(samples: Samples) -> bool:
+    return isinstance(samples, Sequence) and np.ndim(samples[0]) > 0
+
+
+def _strata(samples: Samples) -> list[np.ndarray]:
+    return [np.asarray(x) for x in (samples if _stratified(samples) else [samples])]
+
+
+def _tail(level: float) -> float:
     if not 0 < level < 1:
         raise ValueError(f"the level of an interval is {level}; it must lie between 0 and 1")
-    draws = jax.random.choice(key, samples, (resamples, samples.shape[0]))
-    tail = (1 - level) / 2
-    return jnp.quantile(jax.vmap(statistic)(draws), jnp.array([tail, 1 - tail]))
+    return (1 - level) / 2

@@ -1,1 +1,1 @@
-"""From the files of studies to what people read: statistics, figures, tables, one page."""
+"""Statistics, figures, tables and a page from the results of sweeps."""

@@ -1,12 +1,12 @@
-"""What a report says of groups: summaries, pairs of algorithms, scores that tasks can share, samples to reach a return."""
+"""Comparisons of groups: intervals, pairs of algorithms, normalised scores, sample efficiency."""
 
-from collections.abc import Iterable, Iterator, Sequence
-from typing import NamedTuple
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from dgae_jax.configs.algorithms import ALGORITHMS
-from dgae_jax.report import statistics
+from dgae_jax.maths.statistics import bootstrap_interval, iqm
 from dgae_jax.report.groups import Group, by_task
 
 ALL = "all tasks"
@@ -14,16 +14,19 @@ ALL = "all tasks"
 REACH = (0.5, 0.9)
 """Shares of the best mean return of a task."""
 
+Strata = Sequence[np.ndarray]
+"""Scores [..., S] of each task."""
+
 
 class Estimate(NamedTuple):
-    """A number and its 95 % interval; None where there is a single seed."""
+    """A number and its 95 % interval; None with a single seed."""
 
     value: float
     interval: np.ndarray | None
 
 
 class Improvement(NamedTuple):
-    """P(better > worse) on one task, or over all that have both."""
+    """P(better > worse) on one task, or over all tasks that have both."""
 
     task: str
     better: Group
@@ -31,18 +34,55 @@ class Improvement(NamedTuple):
     estimate: Estimate
 
 
-def estimate(statistic, *samples: statistics.Strata) -> Estimate:
-    """A statistic of samples, with its interval."""
-    return Estimate(float(statistic(*samples)), statistics.interval(statistic, *samples))
+def interval(statistic: Callable[[Any], Any], strata: Strata) -> np.ndarray | None:
+    """Return the 95 % interval of a statistic, or None if a task has a single seed."""
+    if min(map(len, strata)) < 2:
+        return None
+    return bootstrap_interval(list(strata), statistic)
 
 
 def interquartile_mean(scores: np.ndarray) -> Estimate:
-    """Of scores [S]."""
-    return estimate(statistics.interquartile_mean, [scores])
+    """Estimate the interquartile mean of scores [S]."""
+    return _estimate(iqm, [scores])
+
+
+def difference(first: np.ndarray, second: np.ndarray) -> Estimate:
+    """Estimate the difference of the interquartile means of scores [S], second minus first."""
+    return _estimate(lambda scores: iqm(scores[1:]) - iqm(scores[:1]), [first, second])
+
+
+def improvement(better: Strata, worse: Strata) -> Estimate:
+    """Estimate the probability that a seed of `better` scores higher than one of `worse`.
+
+    Ties count half; the probability is averaged over tasks (Agarwal et al. 2021).
+    """
+    tasks = len(better)
+
+    def probability(strata: Strata) -> np.ndarray:
+        pairs = zip(strata[:tasks], strata[tasks:], strict=True)
+        return np.mean([_wins(x, y) for x, y in pairs], axis=0)
+
+    return _estimate(probability, [*better, *worse])
+
+
+def _estimate(statistic: Callable[[Any], Any], strata: Strata) -> Estimate:
+    return Estimate(float(statistic(strata)), interval(statistic, strata))
+
+
+def _wins(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    # one rival at a time: all pairs of all draws would need much memory
+    rivals = np.moveaxis(y, -1, 0)[..., None]
+    return np.mean([((x > rival) + 0.5 * (x == rival)).mean(-1) for rival in rivals], axis=0)
+
+
+def performance_profile(strata: Strata, taus: np.ndarray) -> np.ndarray:
+    """Return the share [..., T] of all seeds that score above each of `taus` [T]."""
+    scores = np.concatenate(strata, axis=-1)
+    return np.stack([(scores > tau).mean(-1) for tau in taus], axis=-1)
 
 
 def pairs() -> Iterator[tuple[str, str]]:
-    """Each distributional algorithm with the scalar one that updates its policy in the same way."""
+    """Yield each distributional algorithm with the scalar one of the same policy update."""
     for name, row in ALGORITHMS.items():
         if row.residual == "distributional":
             yield from (
@@ -53,7 +93,12 @@ def pairs() -> Iterator[tuple[str, str]]:
 
 
 def improvements(groups: Iterable[Group]) -> list[Improvement]:
-    """For each pair: every distributional group of a task against the scalar one of the first settings; then over all tasks."""
+    """Compare distributional and scalar algorithms.
+
+    Returns:
+        For each pair, every distributional group of a task against the first scalar group, then
+        the first groups over all tasks.
+    """
     groups, out = list(groups), []
     for better, worse in pairs():
         duels = [
@@ -71,13 +116,15 @@ def improvements(groups: Iterable[Group]) -> list[Improvement]:
 
 def _improvement(task: str, duels: Sequence[tuple[Group, Group]]) -> Improvement:
     better, worse = [one.finals for one, _ in duels], [other.finals for _, other in duels]
-    return Improvement(task, *duels[0], estimate(statistics.improvement, better, worse))
+    return Improvement(task, *duels[0], improvement(better, worse))
 
 
 def normalised(groups: Iterable[Group]) -> dict[str, tuple[Group, list[np.ndarray]]]:
-    """By name a group and the scores [S] of each of its tasks: final returns over the best mean final return of the task.
+    """Divide final returns by the best mean final return of their task.
 
-    Tasks whose best mean is not positive have no such score and are left out.
+    Returns:
+        By name, a group and the scores [S] of each of its tasks. Tasks without a positive mean
+        return have no scores.
     """
     out: dict[str, tuple[Group, list[np.ndarray]]] = {}
     for members in by_task(groups).values():
@@ -88,23 +135,18 @@ def normalised(groups: Iterable[Group]) -> dict[str, tuple[Group, list[np.ndarra
 
 
 def best_mean(groups: Iterable[Group]) -> float | None:
-    """The highest mean over seeds of the return while training, of all these groups; None where no episode has ended."""
-    return max(
-        (
-            float(curve.mean(0).max())
-            for _, curve in (group.curve for group in groups)
-            if curve.size
-        ),
-        default=None,
-    )
+    """Return the highest training return of the groups, averaged over seeds; None without one."""
+    curves = [group.curve[1] for group in groups]
+    return max((float(curve.mean(0).max()) for curve in curves if curve.size), default=None)
 
 
 def reached(group: Group, best: float | None) -> list[int | None]:
-    """Samples after which the mean over seeds reaches each share `REACH` of `best`; None if it does not, or if best is not positive."""
-    if best is None or best <= 0:
-        return [None] * len(REACH)
+    """Return the samples after which the mean over seeds reaches each share `REACH` of `best`.
+
+    None for a share that is not reached, and for all if `best` is not positive.
+    """
     steps, curve = group.curve
-    return [
-        statistics.steps_to_reach(steps, curve.mean(0), share * best) if curve.size else None
-        for share in REACH
-    ]
+    if best is None or best <= 0 or not curve.size:
+        return [None] * len(REACH)
+    above = [steps[curve.mean(0) >= share * best] for share in REACH]
+    return [int(found[0]) if len(found) else None for found in above]

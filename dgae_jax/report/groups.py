@@ -1,6 +1,7 @@
-"""Rows that belong together: the seeds of one task, one algorithm and the same settings."""
+"""Groups of rows: the seeds of one task, one algorithm and the same hyperparameters."""
 
-from collections.abc import Iterable
+import json
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -9,11 +10,11 @@ import numpy as np
 from dgae_jax.configs.algorithms import ALGORITHMS
 from dgae_jax.configs.serial import flat
 from dgae_jax.envs.registry import TASKS
-from dgae_jax.report import statistics
 from dgae_jax.report.results import Row
+from dgae_jax.run.evaluation import mean_of_worst
 
-SEEDS = ("schema", "seed", "num_seeds")
-"""What of a configuration does not make another experiment of it."""
+SEEDS = ("seed", "num_seeds")
+"""Settings that do not make another experiment."""
 
 
 @dataclass(frozen=True)
@@ -23,92 +24,118 @@ class Group:
     task: str
     algo: str
     variant: str
-    """Its name among the variants of a question; else what differs from the first settings of this task and algorithm, empty for
-    those themselves."""
+    """Name of the variant in an ablation; else the differences from the first group of this task
+    and algorithm, empty for that group."""
     number: int
-    """0 for the first settings, 1 for the next."""
+    """0 for the first group of this task and algorithm, 1 for the next."""
     rows: tuple[Row, ...]
 
     @property
     def name(self) -> str:
-        """As people read it."""
+        """Label in tables and figures."""
         return f"{self.algo.upper()} ({self.variant})" if self.variant else self.algo.upper()
 
     @property
     def finals(self) -> np.ndarray:
-        """[S] mean returns of the last policies."""
+        """Mean returns [S] of the final policies."""
         return np.array([row.final for row in self.rows])
 
     @property
     def worst(self) -> np.ndarray:
-        """[S] mean returns of the worst quarter of their episodes."""
-        return np.array([row.worst for row in self.rows])
+        """Mean returns [S] of the worst quarter of the final policies' episodes."""
+        return np.array([mean_of_worst(row.returns, 0.25) for row in self.rows])
 
     @property
     def averages(self) -> np.ndarray:
-        """[S] episode returns while training, averaged over the run."""
-        return np.array([row.average for row in self.rows])
+        """Episode returns [S] averaged over training; NaN if no episode ended."""
+        curves = [row.curve_returns[np.isfinite(row.curve_returns)] for row in self.rows]
+        return np.array([curve.mean() if curve.size else np.nan for curve in curves])
 
     @property
     def curve(self) -> tuple[np.ndarray, np.ndarray]:
-        """Steps [P] that all seeds cover and the episode returns [S, P] there while training."""
-        return statistics.common_curve([(row.curve_steps, row.curve_returns) for row in self.rows])
+        """Steps [P] that all seeds cover and their episode returns [S, P] during training."""
+        return common_curve([(row.curve_steps, row.curve_returns) for row in self.rows])
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        """Settings by dotted path, without seeds."""
+        return _settings(self.rows[0])
 
 
 def groups_of(rows: Iterable[Row]) -> list[Group]:
-    """All groups, by task and algorithm in the order of their tables, then as the study has them."""
+    """Group rows by task and algorithm, then by variant and settings in the order of the rows.
+
+    Args:
+        rows: Rows of one sweep; their configurations are compared after the schema upgrade, so
+            that rows of different versions share a group.
+    """
     by_kind: dict[tuple[str, str], dict[tuple[str | None, str], list[Row]]] = {}
     for row in sorted(rows, key=order):
-        by_kind.setdefault((row.task, row.algo), {}).setdefault((row.variant, row.hash), []).append(
-            row
-        )
-    return [
-        Group(
-            task,
-            algo,
-            _variant(next(iter(variants.values()))[0], members[0], number),
-            number,
-            tuple(members),
-        )
-        for (task, algo), variants in by_kind.items()
-        for number, members in enumerate(variants.values())
-    ]
+        key = row.variant, json.dumps(_settings(row), sort_keys=True)
+        by_kind.setdefault((row.task, row.algo), {}).setdefault(key, []).append(row)
+    groups = []
+    for (task, algo), variants in by_kind.items():
+        members = list(variants.values())
+        for number, seeds in enumerate(members):
+            variant = _variant(members[0][0], seeds[0], number)
+            groups.append(Group(task, algo, variant, number, tuple(seeds)))
+    return groups
 
 
 def by_task(groups: Iterable[Group]) -> dict[str, list[Group]]:
-    """The groups of each task."""
+    """Return the groups of each task."""
     out: dict[str, list[Group]] = {}
     for group in groups:
         out.setdefault(group.task, []).append(group)
     return out
 
 
-def shown(value: Any) -> str:
-    """The value of a setting as it is written on a command line."""
-    return (
-        " ".join(map(str, value))
-        if isinstance(value, list)
-        else "–"
-        if value is None
-        else str(value)
-    )
-
-
 def order(row: Row) -> tuple:
-    """What rows are sorted by: task, algorithm, seed; what is alike in these stays as the study has it."""
+    """Return the sort key of a row: task, algorithm, seed."""
     tasks = list(TASKS)
     place = tasks.index(row.env) if row.env in tasks else len(tasks)
     return place, row.task, list(ALGORITHMS).index(row.algo), row.seed
 
 
+def shown(value: Any) -> str:
+    """Return the value of a setting as on a command line."""
+    if isinstance(value, list):
+        return " ".join(map(str, value))
+    return "–" if value is None else str(value)
+
+
+def common_curve(
+    curves: Sequence[tuple[np.ndarray, np.ndarray]], points: int = 200
+) -> tuple[np.ndarray, np.ndarray]:
+    """Interpolate curves at the steps that all of them cover.
+
+    Args:
+        curves: Steps [I] and values [I] of each curve, NaN where there is none. Curves without
+            values are left out.
+        points: Number of steps to which those of all curves are thinned, evenly.
+
+    Returns:
+        Steps [P] and values [S, P].
+    """
+    known = [(steps[np.isfinite(values)], values[np.isfinite(values)]) for steps, values in curves]
+    known = [(steps, values) for steps, values in known if len(steps)]
+    if not known:
+        return np.empty(0), np.empty((0, 0))
+    first, last = max(steps[0] for steps, _ in known), min(steps[-1] for steps, _ in known)
+    grid = np.unique(np.concatenate([steps for steps, _ in known]))
+    grid = grid[(grid >= first) & (grid <= last)]
+    grid = grid[np.linspace(0, len(grid) - 1, min(len(grid), points)).round().astype(int)]
+    return grid, np.array([np.interp(grid, steps, values) for steps, values in known])
+
+
+def _settings(row: Row) -> dict[str, Any]:
+    return {name: value for name, value in flat(row.config).items() if name not in SEEDS}
+
+
 def _variant(first: Row, other: Row, number: int, most: int = 3) -> str:
     if other.variant or not number:
         return (other.variant or "").removesuffix("+noise")  # the task says so
-    ours, theirs = flat(first.config), flat(other.config)
-    differ = [
-        name
-        for name in {**ours, **theirs}
-        if name not in SEEDS and ours.get(name) != theirs.get(name)
-    ]
-    named = [f"{name} {shown(theirs.get(name))}" for name in differ[:most]] or [other.hash]
-    return ", ".join(named) + (f" and {len(differ) - most} more" if len(differ) > most else "")
+    ours, theirs = _settings(first), _settings(other)
+    differ = [name for name in {**ours, **theirs} if ours.get(name) != theirs.get(name)]
+    named = ", ".join(f"{name} {shown(theirs.get(name))}" for name in differ[:most])
+    return named + (f" and {len(differ) - most} more" if len(differ) > most else "")

@@ -1,7 +1,7 @@
-"""Tables inside documents: what stands between two markers is replaced by the table of that name.
+"""Tables inside Markdown documents, between `<!-- dgae report: NAME -->` and `<!-- /dgae report -->`.
 
-The markers are `<!-- dgae report: NAME -->` and `<!-- /dgae report -->`, on lines of their own. With `NAME of STUDY` a table is replaced
-by a report on the study in a directory of that name only, so that a document may have tables of several.
+Markers stand on lines of their own. `NAME of SWEEP` names the directory of a sweep; a report on
+another sweep leaves that table alone.
 """
 
 import re
@@ -15,6 +15,7 @@ from dgae_jax.report.groups import Group
 from dgae_jax.run import files
 
 TABLES: dict[str, Callable[[Sequence[Group]], tables.Table]] = {
+    "iqm": tables.interquartile_means,
     "returns": tables.returns,
     "improvement": lambda groups: tables.improvement(analysis.improvements(groups)),
     "attribution": tables.attribution,
@@ -25,89 +26,79 @@ TABLES: dict[str, Callable[[Sequence[Group]], tables.Table]] = {
 }
 
 _MARKER = re.compile(
-    r"^<!-- (?:dgae report: (?P<name>.*?)(?: of (?P<study>.*?))?|(?P<end>/dgae report)) -->$",
-    re.MULTILINE,
+    r"^<!-- (?:dgae report: (?P<name>.*?)(?: of (?P<sweep>.*?))?|/dgae report) -->$", re.MULTILINE
 )
 
 
 class Block(NamedTuple):
-    """What stands between a pair of markers."""
+    """A table between a pair of markers."""
 
     name: str
-    study: str | None
+    sweep: str | None
     start: int
     end: int
 
 
-def blocks(path: Path, study: str) -> list[Block]:
-    """The tables that a report on `study`, the name of its directory, replaces.
+def blocks(path: Path, sweep: str) -> list[Block]:
+    """Return the tables of a document that a report on a sweep replaces.
 
-    Raises ConfigError where there are none, where the markers are missing or do not match, and where some tables name their study and
-    others do not.
+    Args:
+        path: The document.
+        sweep: Name of the sweep's directory.
+
+    Raises:
+        ConfigError: the file cannot be read, markers are missing or do not match, no table is of
+            the sweep, or only some tables name their sweep.
     """
-    found = _blocks(path)
-    studies = ", ".join(dict.fromkeys(block.study for block in found if block.study))
-    nameless = next((block.name for block in found if block.study is None), None)
-    if nameless and studies:
-        raise invalid(
-            "markdown",
-            path,
-            f"a file with {nameless} of STUDY, not {nameless}, where other tables are of {studies}",
-        )
-    mine = [block for block in found if block.study in (None, study)]
-    if not mine:
-        raise invalid(
-            "markdown", path, f"a file with a table of {study}; its tables are of {studies}"
-        )
-    return mine
+    return _blocks(path, _text(path), sweep)
 
 
-def _blocks(path: Path) -> list[Block]:
-    markers = list(_MARKER.finditer(_text(path)))
-    if not markers:
-        raise invalid(
-            "markdown",
-            path,
-            "a file with <!-- dgae report: NAME --> and <!-- /dgae report --> on lines of their own",
-        )
-    openings, ends = markers[::2], markers[1::2]
-    for opening, end in zip(openings, [*ends, None], strict=False):
-        name = opening["name"]
-        if name is None:
-            raise invalid(
-                "markdown", path, "a file without <!-- /dgae report --> where no table begins"
-            )
-        if name not in TABLES:
-            raise invalid(
-                "markdown", path, f"a file with tables named {', '.join(TABLES)}, not {name}"
-            )
-        if end is None or end["end"] is None:
-            raise invalid(
-                "markdown", path, f"a file with <!-- /dgae report --> after the table {name}"
-            )
-    return [
-        Block(opening["name"], opening["study"], opening.end() + 1, end.start())
-        for opening, end in zip(openings, ends, strict=True)
-    ]
+def replace(path: Path, groups: Sequence[Group], sweep: str) -> list[str]:
+    """Replace the tables of a document that are of a sweep.
 
+    Returns:
+        Names of the tables.
 
-def replace(path: Path, groups: Sequence[Group], study: str) -> list[str]:
-    """Replace every block of the file that is of the study by its table; their names."""
-    text, found = _text(path), blocks(path, study)
+    Raises:
+        ConfigError: as `blocks`, or the file cannot be written.
+    """
+    text = _text(path)
+    found = _blocks(path, text, sweep)
     for block in reversed(found):
-        text = (
-            text[: block.start]
-            + tables.markdown(TABLES[block.name](groups))
-            + "\n"
-            + text[block.end :]
-        )
+        table = tables.markdown(TABLES[block.name](groups))
+        text = f"{text[: block.start]}{table}\n{text[block.end :]}"
     try:
         files.replace(path, text.encode())
     except OSError as reason:
-        raise invalid(
-            "markdown", path, f"a file that can be written ({reason.strerror})"
-        ) from reason
+        raise _refused(path, f"that can be written ({reason.strerror})") from reason
     return [block.name for block in found]
+
+
+def _blocks(path: Path, text: str, sweep: str) -> list[Block]:
+    markers = list(_MARKER.finditer(text))
+    if not markers:
+        raise _refused(
+            path, "with <!-- dgae report: NAME --> and <!-- /dgae report --> on lines of their own"
+        )
+    found = []
+    for start, end in zip(markers[::2], [*markers[1::2], None], strict=False):
+        name = start["name"]
+        if name is None:
+            raise _refused(path, "without <!-- /dgae report --> before a table begins")
+        if name not in TABLES:
+            raise _refused(path, f"with tables named {', '.join(TABLES)}, not {name}")
+        if end is None or end["name"]:
+            raise _refused(path, f"with <!-- /dgae report --> after the table {name}")
+        found.append(Block(name, start["sweep"], start.end() + 1, end.start()))
+    sweeps = ", ".join(dict.fromkeys(block.sweep for block in found if block.sweep))
+    for block in found:
+        if sweeps and block.sweep is None:
+            raise _refused(
+                path, f"with {block.name} of SWEEP, because other tables are of {sweeps}"
+            )
+    if mine := [block for block in found if block.sweep in (None, sweep)]:
+        return mine
+    raise _refused(path, f"with a table of {sweep}; its tables are of {sweeps}")
 
 
 def _text(path: Path) -> str:
@@ -115,6 +106,8 @@ def _text(path: Path) -> str:
         return path.read_bytes().decode()
     except (OSError, UnicodeDecodeError) as reason:
         why = getattr(reason, "strerror", None) or "not text in UTF-8"
-        raise ConfigError(
-            f"markdown {path}: must be a file that can be read ({why})", "markdown"
-        ) from reason
+        raise _refused(path, f"that can be read ({why})") from reason
+
+
+def _refused(path: Path, allowed: str) -> ConfigError:
+    return invalid("markdown", path, f"a file {allowed}")

@@ -1,21 +1,19 @@
-"""The rows of a study: one per trained seed, read strictly from `results.jsonl`.
+"""Results of a sweep: one row per trained seed, read strictly from `results.jsonl`."""
 
-Keys that no report needs are not looked at; those that it needs must be there and have the right type.
-"""
-
+import csv
 import json
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from types import NoneType
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from dgae_jax.configs.algorithms import ALGORITHMS
 from dgae_jax.configs.config import ConfigError
+from dgae_jax.configs.serial import upgraded
 from dgae_jax.run import files, terminal
-from dgae_jax.run.evaluation import cvar
 
 RESULTS = "results.jsonl"
 
@@ -24,214 +22,234 @@ RESULTS = "results.jsonl"
 class Row:
     """One trained seed."""
 
-    cell: str
+    run: str
+    """Name of the run in its sweep."""
     env: str
     env_version: str | None
     algo: str
     variant: str | None
-    """Its name among the variants of a question; None in a study of algorithms."""
+    """Name of the variant in an ablation; None in a comparison of algorithms."""
     seed: int
     total_steps: int
-    hash: str
-    """Of the configuration without its seeds: rows that share it differ by chance only."""
     engine: str
-    """Where the policy was evaluated."""
+    """Simulator of the final evaluation."""
     final: float
-    """Mean return of the last policy over its episodes."""
-    worst: float
-    """Mean return of the worst quarter of them."""
+    """Mean return of the final policy."""
+    returns: np.ndarray
+    """Returns [E] of the final policy's episodes."""
     best: float | None
-    """Mean return of the best of the policies that were evaluated along the way; None if none was."""
-    best_steps: int | None
+    """Mean return of the best checkpoint; None without evaluations during training."""
     curve_steps: np.ndarray
-    """[I] samples, increasing."""
+    """Samples [I], increasing."""
     curve_returns: np.ndarray
-    """[I] undiscounted episode return while training; NaN where no episode has ended yet."""
+    """Undiscounted episode returns [I] during training; NaN before the first episode ends."""
     seconds: float
     samples_per_second: float
     config: dict[str, Any]
+    """The configuration in today's names, without its schema."""
     versions: dict[str, Any]
     machine: dict[str, Any]
     git_revision: str | None
     command: str
 
     @property
-    def average(self) -> float:
-        """Episode return while training, averaged over the curve from the first on; NaN where no episode has ended."""
-        known = self.curve_returns[np.isfinite(self.curve_returns)]
-        return float(known.mean()) if known.size else math.nan
-
-    @property
     def task(self) -> str:
-        """The task with its version, where it has one, and whether there is noise on it."""
+        """The env with its version, if it has one, and whether it is noisy."""
         noise = " with noise" if any((self.config.get("noise") or {}).values()) else ""
         return (f"{self.env}-{self.env_version}" if self.env_version else self.env) + noise
 
 
 @dataclass(frozen=True)
-class Study:
+class Sweep:
     """A directory of runs, or a file of their results."""
 
     path: Path
     rows: tuple[Row, ...]
     planned: tuple[str, ...] | None
-    """Names of the cells in study.json; None for a file of results alone."""
+    """Names of the runs in study.json; None for a file of results."""
     diverged: tuple[tuple[str, int], ...] = ()
-    """Cells and seeds without a row here, because their return is not finite."""
-
-    @property
-    def name(self) -> str:
-        """Of the directory."""
-        return self.directory.resolve().name
+    """Runs and seeds that are left out, because their return is not finite."""
 
     @property
     def directory(self) -> Path:
-        """Where the results lie."""
+        """Directory of the results."""
         return self.path if self.path.is_dir() else self.path.parent
 
     @property
+    def name(self) -> str:
+        """Name of the directory."""
+        return self.directory.resolve().name
+
+    @property
     def missing(self) -> list[str]:
-        """Planned cells without a result."""
-        done = {row.cell for row in self.rows} | {cell for cell, _ in self.diverged}
-        return [cell for cell in self.planned or () if cell not in done]
+        """Planned runs without a result."""
+        done = {row.run for row in self.rows} | {run for run, _ in self.diverged}
+        return [run for run in self.planned or () if run not in done]
 
 
-def read(path: Path) -> Study:
-    """The study in the directory `path`, or of the results in the file `path`.
+def read(path: Path) -> Sweep:
+    """Read the results of a sweep.
 
-    Raises ConfigError, in one line, where there is no study, no result yet, or a row that cannot be understood.
+    Args:
+        path: Directory of a sweep, or a file of results. A last line without an end is still being
+            written and is not read.
+
+    Raises:
+        ConfigError: no sweep, no results yet, or a row that cannot be understood.
     """
     try:
         if not path.exists():
-            raise ConfigError(f"{path}: must be the directory of a study; there is nothing")
+            raise ConfigError(f"{path}: must be the directory of a sweep; it does not exist")
         file = path / RESULTS if path.is_dir() else path
         if not file.exists() and not (path / "study.json").exists():
             raise ConfigError(
-                f"{path}: must be the directory of a study, with study.json and {RESULTS}"
+                f"{path}: must be the directory of a sweep, with study.json and {RESULTS}"
             )
         rows, diverged = _rows(file) if file.exists() else ((), ())
         planned = _planned(path / "study.json") if path.is_dir() else None
     except OSError as reason:
         raise ConfigError(
-            f"{path}: must be a study that can be read ({reason.strerror})"
+            f"{path}: must be a sweep that can be read ({reason.strerror})"
         ) from reason
     if not rows:
         raise ConfigError(f"{path}: must have results; {RESULTS} has none yet")
-    return Study(path, rows, planned, diverged)
+    return Sweep(path, rows, planned, diverged)
 
 
 def _planned(path: Path) -> tuple[str, ...] | None:
     if not path.exists():
         return None
     try:
-        cells = json.loads(path.read_bytes())["cells"]
-        return tuple(cells.keys())
+        return tuple(json.loads(path.read_bytes())["cells"].keys())
     except (ValueError, RecursionError, KeyError, TypeError, AttributeError):
-        raise ConfigError(f"{path}: must be an object with the cells of the study") from None
+        raise ConfigError(f"{path}: must be an object with the runs of the sweep") from None
 
 
 def _rows(path: Path) -> tuple[tuple[Row, ...], tuple[tuple[str, int], ...]]:
-    """The rows, and the cells and seeds that diverged."""
+    """Return the rows, and the runs and seeds that diverged."""
     rows, diverged, end, number, seen = [], [], 0, 0, set()
     for number, (data, after) in enumerate(files.whole_rows(path), start=1):
-        end = after
-        if _diverged(data):
-            cell, seed = (
-                _field(data, name, f"{path} line {number}", *FIELDS[name])
-                for name in ("cell", "seed")
-            )
+        where, end = f"{path} line {number}", after
+        key = _field(data, "cell", where), _field(data, "seed", where)
+        if key in seen:
+            raise ConfigError(f"{where}: run {key[0]}, seed {key[1]} is there twice")
+        seen.add(key)
+        final = data.get("final")
+        if isinstance(final, dict) and final.get("return_mean", 0) is None:  # null: not finite
             terminal.warn(
-                f"warning: {path} line {number}: left out, because the return of cell {cell}, seed {seed} is not finite"
+                f"warning: {where}: left out: the return of run {key[0]}, seed {key[1]} is not "
+                "finite"
             )
-            diverged.append((cell, seed))
-            continue
-        row = _row(data, f"{path} line {number}")
-        if (row.cell, row.seed) in seen:
-            raise ConfigError(
-                f"{path} line {number}: cell {row.cell}, seed {row.seed} is there twice"
-            )
-        seen.add((row.cell, row.seed))
-        rows.append(row)
-    if b"\n" in path.read_bytes()[end:]:  # a last line without an end is still being written
+            diverged.append(key)
+        else:
+            rows.append(_row(data, where))
+    if b"\n" in path.read_bytes()[end:]:
         raise ConfigError(f"{path} line {number + 1}: must be an object in JSON")
     return tuple(rows), tuple(diverged)
 
 
-def _diverged(data: dict[str, Any]) -> bool:
-    """JSON has null for a return that is not finite."""
-    final = data.get("final")
-    return isinstance(final, dict) and final.get("return_mean", 0) is None
+FIELDS: dict[str, tuple[type, ...]] = {
+    "cell": (str,),
+    "env": (str,),
+    "env_version": (str, NoneType),
+    "algo": (str,),
+    "variant": (str, NoneType),
+    "seed": (int,),
+    "total_steps": (int,),
+    "final.engine": (str,),
+    "final.return_mean": (float,),
+    "final.returns": (list,),
+    "best": (dict, NoneType),
+    "curve.steps": (list,),
+    "curve.return": (list,),
+    "seconds": (float,),
+    "samples_per_second": (float,),
+    "config": (dict,),
+    "versions": (dict,),
+    "machine": (dict,),
+    "git_revision": (str, NoneType),
+    "command": (str,),
+}
+"""Types of the fields that a report needs; others are ignored."""
 
-
-def _is(*kinds: type) -> Callable[[Any], bool]:
-    return lambda value: type(value) in kinds
-
-
-def _number(value: Any) -> bool:
-    return type(value) in (int, float) and math.isfinite(value)
-
-
-def _list(test: Callable[[Any], bool]) -> Callable[[Any], bool]:
-    return lambda value: isinstance(value, list) and all(map(test, value))
-
-
-_numbers = _list(_number)
-_TEXT, _TEXT_OR_NONE = (_is(str), "a string"), (_is(str, type(None)), "a string or null")
-_WHOLE, _NUMBER, _OBJECT = (
-    (_is(int), "a whole number"),
-    (_number, "a number"),
-    (_is(dict), "an object"),
-)
-
-FIELDS = {
-    "cell": _TEXT, "env": _TEXT, "env_version": _TEXT_OR_NONE, "algo": (ALGORITHMS.__contains__, f"one of {', '.join(ALGORITHMS)}"),
-    "variant": _TEXT_OR_NONE, "seed": _WHOLE, "total_steps": _WHOLE, "hash": _TEXT, "final": _OBJECT, "final.engine": _TEXT,
-    "final.return_mean": _NUMBER, "final.returns": (lambda value: _numbers(value) and bool(value), "a list of numbers, one at least"),
-    "best": (_is(dict, type(None)), "an object or null"), "curve": _OBJECT,
-    "curve.steps": (_list(_is(int)), "a list of whole numbers"),
-    "curve.return": (_list(lambda value: value is None or _number(value)), "a list of numbers, null where there is none"),
-    "seconds": _NUMBER, "samples_per_second": _NUMBER, "config": _OBJECT, "versions": _OBJECT, "machine": _OBJECT,
-    "git_revision": _TEXT_OR_NONE, "command": _TEXT,
-}  # fmt: skip
-"""What a row must have, by its path, and what each must be."""
-
-BEST = {"best.steps": _WHOLE, "best.return_mean": _NUMBER}
-"""What it must have besides where `best` is an object."""
+_NAMES = {
+    str: "a string",
+    int: "a whole number",
+    float: "a number",
+    dict: "an object",
+    list: "a list of numbers",
+    NoneType: "null",
+}
 
 
 def _row(data: dict[str, Any], where: str) -> Row:
-    found = {path: _field(data, path, where, *kind) for path, kind in FIELDS.items()}
-    best = (
-        {path: _field(data, path, where, *kind) for path, kind in BEST.items()}
-        if found["best"]
-        else {}
-    )
-    steps, returns = np.array(found["curve.steps"], float), np.array(found["curve.return"], float)
-    if len(steps) != len(returns) or (np.diff(steps) <= 0).any():
+    found = {path: _field(data, path, where) for path in FIELDS}
+    if found["algo"] not in ALGORITHMS:
+        raise ConfigError(f"{where}: algo: must be one of {', '.join(ALGORITHMS)}")
+    steps, curve = found.pop("curve.steps"), found.pop("curve.return")
+    if len(steps) != len(curve) or not (np.diff(steps) > 0).all():
         raise ConfigError(f"{where}: curve: must have increasing steps and a return for each")
-    same = ("cell", "env", "env_version", "algo", "variant", "seed", "total_steps", "hash", "seconds", "samples_per_second", "config",
-            "versions", "machine", "git_revision", "command")  # fmt: skip
+    try:
+        config = upgraded(found.pop("config"))
+    except ConfigError as reason:
+        raise ConfigError(f"{where}: config: {reason}") from reason
     return Row(
-        **{name: found[name] for name in same},
-        engine=found["final.engine"],
-        final=float(found["final.return_mean"]),
-        worst=cvar(np.array(found["final.returns"]), 0.25),
-        best=best.get("best.return_mean"),
-        best_steps=best.get("best.steps"),
+        run=found.pop("cell"),
+        engine=found.pop("final.engine"),
+        final=float(found.pop("final.return_mean")),
+        returns=found.pop("final.returns"),
+        best=_field(data, "best.return_mean", where, (float,)) if found.pop("best") else None,
         curve_steps=steps,
-        curve_returns=returns,
+        curve_returns=curve,
+        config=config,
+        **found,
     )
 
 
-def _field(data: Any, path: str, where: str, test: Callable[[Any], bool], allowed: str) -> Any:
+def _field(data: Any, path: str, where: str, kinds: tuple[type, ...] = ()) -> Any:
+    """Return the value at a path, lists as arrays [N] with NaN for null."""
     for name in path.split("."):
-        if name not in data:
+        if not isinstance(data, dict) or name not in data:
             raise ConfigError(f"{where}: {path}: missing")
         data = data[name]
-    try:
-        accepted = test(data)
-    except TypeError:  # not hashable
-        accepted = False
-    if not accepted:
-        raise ConfigError(f"{where}: {path}: must be {allowed}")
-    return data
+    kinds = kinds or FIELDS[path]
+    if float in kinds and type(data) in (int, float) and math.isfinite(data):
+        return data
+    if type(data) is list and list in kinds and all(_is_number(value) for value in data):
+        return np.array(data, float)
+    if type(data) in kinds and type(data) not in (float, list):
+        return data
+    raise ConfigError(f"{where}: {path}: must be {' or '.join(_NAMES[kind] for kind in kinds)}")
+
+
+def _is_number(value: Any) -> bool:
+    return value is None or type(value) in (int, float)
+
+
+class Published(NamedTuple):
+    """A published result; `spread` and `seeds` are None if the source does not report them."""
+
+    task: str
+    samples: int
+    algorithm: str
+    mean: float
+    spread: float | None
+    seeds: int | None
+    source: str
+
+
+def published() -> list[Published]:
+    """Return the published results of published.csv."""
+    with Path(__file__).with_name("published.csv").open(newline="") as file:
+        return [
+            Published(
+                task=row["task"],
+                samples=int(row["samples"]),
+                algorithm=row["algorithm"],
+                mean=float(row["mean"]),
+                spread=float(row["spread"]) if row["spread"] else None,
+                seeds=int(row["seeds"]) if row["seeds"] else None,
+                source=row["source"],
+            )
+            for row in csv.DictReader(file)
+        ]
