@@ -12,7 +12,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from dgae_jax.cli.arguments import parse
-from dgae_jax.report import calibration as picture
+from dgae_jax.report import figures
 from dgae_jax.report.results import Row, read
 from dgae_jax.run import checkpoint, directory, metrics, runtime
 from dgae_jax.run.calibration import calibrate, refit
@@ -38,7 +38,7 @@ class Arguments:
 
 def row(study: Path, cell: Row) -> dict:
     """TrainableState and calibrate one, in other episodes than those it was fitted to."""
-    source = study / "policies" / f"{cell.cell}.msgpack"
+    source = study / "policies" / f"{cell.run}.msgpack"
     with TemporaryDirectory() as place:
         made, file = (
             refit(source, directory.config_of(source), which="latest"),
@@ -61,7 +61,7 @@ def main() -> None:
     file, known, shown = arguments.json, {}, {}
     if file and file.exists():
         known = {each["checkpoint"]: each for each in json.loads(file.read_text())["rows"]}
-    cells = {f"{cell.cell}.msgpack": cell for cell in read(arguments.study).rows}
+    cells = {f"{cell.run}.msgpack": cell for cell in read(arguments.study).rows}
     for which in itertools.product(arguments.tasks, arguments.algos, arguments.seeds):
         name = "-".join(map(str, which)) + ".msgpack"
         if name not in known:
@@ -79,7 +79,7 @@ def main() -> None:
             flush=True,
         )
     if arguments.picture:
-        metrics.save_figure(picture.histograms(shown), arguments.picture)
+        metrics.save_figure(figures.pit_histograms(shown), arguments.picture)
 
 
 if __name__ == "__main__":

@@ -82,7 +82,7 @@ def _checked(arguments: Arguments) -> tuple[dict[Path, ResolvedConfig], Path]:
 
 
 def _calibrate(arguments: Arguments, runs: dict[Path, ResolvedConfig], out: Path) -> int:
-    from dgae_jax.report import calibration as picture
+    from dgae_jax.report import figures
     from dgae_jax.run import calibration, metrics, runtime
     from dgae_jax.run.terminal import Reporter
 
@@ -99,10 +99,10 @@ def _calibrate(arguments: Arguments, runs: dict[Path, ResolvedConfig], out: Path
             result = calibration.calibrate(path, config, **how, watch=reporter.watch)
         found[path.resolve().name] = str(config.algo), result
         terminal.say(
-            f"{path.resolve().name}: {picture.held(result)}, "
+            f"{path.resolve().name}: {figures.coverage(result)}, "
             f"{100 * result['crossing']:.0f} % of neighbours cross, rmse {result['rmse']:.3f}, spread {result['spread']:.3f}"
         )
-    _write(out, lambda to: metrics.save_figure(picture.histograms(found), to))
+    _write(out, lambda to: metrics.save_figure(figures.pit_histograms(found), to))
     statistics = {name: result for name, (_, result) in found.items()}
     _write(out.with_suffix(".json"), lambda to: files.write_json(to, statistics))
     terminal.say(f"written {out} and {out.with_suffix('.json').name}")

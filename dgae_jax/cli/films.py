@@ -8,7 +8,7 @@ import numpy as np
 
 from dgae_jax.configs.config import ConfigError, invalid
 from dgae_jax.envs.registry import spec_of
-from dgae_jax.report.results import Row, Study
+from dgae_jax.report.results import Row, Sweep
 from dgae_jax.run import terminal
 
 SECONDS = "8"
@@ -25,7 +25,7 @@ def typical(rows: list[Row]) -> Row:
     return ordered[len(ordered) // 2]
 
 
-def make(study: Study) -> list[Path]:
+def make(study: Sweep) -> list[Path]:
     """Films of the typical run of each task, where there is none yet; raises ConfigError if one cannot be made."""
     written = []
     for task in dict.fromkeys(row.task for row in study.rows):
@@ -34,7 +34,7 @@ def make(study: Study) -> list[Path]:
         if stem.with_name(f"{stem.name}.mp4").exists() or not spec_of(rows[0].env).referees:
             continue
         chosen = typical(rows)
-        run_dir = study.directory / "runs" / chosen.cell
+        run_dir = study.directory / "runs" / chosen.run
         if not run_dir.is_dir():
             raise invalid("videos", True, f"left out: the runs of {study.path} are not here")
         stem.parent.mkdir(exist_ok=True)
@@ -50,7 +50,7 @@ def make(study: Study) -> list[Path]:
             "--index",
             str(index),
         ]
-        terminal.say(f"filming {chosen.cell}")
+        terminal.say(f"filming {chosen.run}")
         # a process of its own: the OpenGL to draw with is chosen before MuJoCo is loaded
         done = subprocess.run(
             [sys.executable, "-m", "dgae_jax.cli.render", *words],

@@ -54,7 +54,7 @@ def main() -> int:
 
 def _report(arguments: Arguments) -> int:
     """Everything that can be wrong is looked at before the first file is written."""
-    from dgae_jax.report import published, results
+    from dgae_jax.report import results
 
     if not arguments.studies:
         raise ConfigError(
@@ -65,16 +65,16 @@ def _report(arguments: Arguments) -> int:
     studies = [results.read(path) for path in arguments.studies]
     out = arguments.out or studies[0].directory / "report"
     check_directory(out)
-    known = published.read() if arguments.published else []
+    known = results.published() if arguments.published else []
     from dgae_jax.cli import films
-    from dgae_jax.report import groups, markdown, write
+    from dgae_jax.report import groups, markdown, page
 
     if arguments.markdown:
-        markdown.blocks(arguments.markdown, studies[0].name)
+        markdown.check(arguments.markdown, studies[0].name)
     if arguments.videos:
         for path in (path for study in studies for path in films.make(study)):
             terminal.say(f"written {path}")
-    for path in write.write(studies, out, known):
+    for path in page.write(studies, out, known):
         terminal.say(f"written {path}")
     if arguments.markdown:
         names = markdown.replace(

@@ -121,9 +121,13 @@ def bootstrap_interval(
     tail = _tail(level)
     generator, strata = np.random.default_rng(seed), _strata(samples)
     draws = [x[generator.integers(len(x), size=(resamples, len(x)))] for x in strata]
-    # 1 − tail is not always the nearest number to (1 + level) / 2
-    ends = [tail, (1 + level) / 2]
-    return np.quantile(statistic(draws if _stratified(samples) else draws[0]), ends, axis=0)
+    found = statistic(draws if _stratified(samples) else draws[0])
+    return np.quantile(found, [tail, (1 + level) / 2], axis=0)
+
+
+def sample_cvar(samples: np.ndarray, share: float) -> float:
+    """Compute the mean of the lowest `share` of samples [S], of one sample at least."""
+    return float(np.sort(samples)[: max(1, round(share * len(samples)))].mean())
 
 
 def _stratified(samples: Samples) -> bool:

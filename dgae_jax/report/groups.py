@@ -10,8 +10,8 @@ import numpy as np
 from dgae_jax.configs.algorithms import ALGORITHMS
 from dgae_jax.configs.serial import flat
 from dgae_jax.envs.registry import TASKS
+from dgae_jax.maths.statistics import sample_cvar
 from dgae_jax.report.results import Row
-from dgae_jax.run.evaluation import mean_of_worst
 
 SEEDS = ("seed", "num_seeds")
 """Settings that do not make another experiment."""
@@ -43,7 +43,7 @@ class Group:
     @property
     def worst(self) -> np.ndarray:
         """Mean returns [S] of the worst quarter of the final policies' episodes."""
-        return np.array([mean_of_worst(row.returns, 0.25) for row in self.rows])
+        return np.array([sample_cvar(row.returns, 0.25) for row in self.rows])
 
     @property
     def averages(self) -> np.ndarray:

@@ -16,7 +16,7 @@ from dgae_jax.report.groups import Group, by_task, groups_of, shown
 from dgae_jax.report.results import Published, Sweep
 from dgae_jax.report.tables import NONE, Table
 from dgae_jax.run import files
-from dgae_jax.run.evaluation import counted
+from dgae_jax.run.terminal import counted
 
 
 def write(sweeps: Sequence[Sweep], out: Path, published: Sequence[Published] = ()) -> list[Path]:

@@ -3,10 +3,10 @@
 import csv
 import json
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from types import NoneType
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, get_args, get_type_hints
 
 import numpy as np
 
@@ -45,10 +45,10 @@ class Row:
     """Undiscounted episode returns [I] during training; NaN before the first episode ends."""
     seconds: float
     samples_per_second: float
-    config: dict[str, Any]
+    config: dict
     """The configuration in today's names, without its schema."""
-    versions: dict[str, Any]
-    machine: dict[str, Any]
+    versions: dict
+    machine: dict
     git_revision: str | None
     command: str
 
@@ -130,7 +130,7 @@ def _rows(path: Path) -> tuple[tuple[Row, ...], tuple[tuple[str, int], ...]]:
     rows, diverged, end, number, seen = [], [], 0, 0, set()
     for number, (data, after) in enumerate(files.whole_rows(path), start=1):
         where, end = f"{path} line {number}", after
-        key = _field(data, "cell", where), _field(data, "seed", where)
+        key = _field(data, "run", where), _field(data, "seed", where)
         if key in seen:
             raise ConfigError(f"{where}: run {key[0]}, seed {key[1]} is there twice")
         seen.add(key)
@@ -148,82 +148,61 @@ def _rows(path: Path) -> tuple[tuple[Row, ...], tuple[tuple[str, int], ...]]:
     return tuple(rows), tuple(diverged)
 
 
-FIELDS: dict[str, tuple[type, ...]] = {
-    "cell": (str,),
-    "env": (str,),
-    "env_version": (str, NoneType),
-    "algo": (str,),
-    "variant": (str, NoneType),
-    "seed": (int,),
-    "total_steps": (int,),
-    "final.engine": (str,),
-    "final.return_mean": (float,),
-    "final.returns": (list,),
-    "best": (dict, NoneType),
-    "curve.steps": (list,),
-    "curve.return": (list,),
-    "seconds": (float,),
-    "samples_per_second": (float,),
-    "config": (dict,),
-    "versions": (dict,),
-    "machine": (dict,),
-    "git_revision": (str, NoneType),
-    "command": (str,),
+PATHS = {
+    "run": "cell",
+    "engine": "final.engine",
+    "final": "final.return_mean",
+    "returns": "final.returns",
+    "best": "best.return_mean",
+    "curve_steps": "curve.steps",
+    "curve_returns": "curve.return",
 }
-"""Types of the fields that a report needs; others are ignored."""
+"""Places of the fields of a `Row` in the file, where they differ from its names."""
+
+_KINDS = get_type_hints(Row)
 
 _NAMES = {
     str: "a string",
     int: "a whole number",
     float: "a number",
     dict: "an object",
-    list: "a list of numbers",
+    np.ndarray: "a list of numbers",
     NoneType: "null",
 }
 
 
 def _row(data: dict[str, Any], where: str) -> Row:
-    found = {path: _field(data, path, where) for path in FIELDS}
-    if found["algo"] not in ALGORITHMS:
+    row = Row(**{name: _field(data, name, where) for name in _KINDS})
+    if row.algo not in ALGORITHMS:
         raise ConfigError(f"{where}: algo: must be one of {', '.join(ALGORITHMS)}")
-    steps, curve = found.pop("curve.steps"), found.pop("curve.return")
-    if len(steps) != len(curve) or not (np.diff(steps) > 0).all():
+    steps = row.curve_steps
+    if len(steps) != len(row.curve_returns) or not (np.diff(steps) > 0).all():
         raise ConfigError(f"{where}: curve: must have increasing steps and a return for each")
     try:
-        config = upgraded(found.pop("config"))
+        return replace(row, config=upgraded(row.config))
     except ConfigError as reason:
         raise ConfigError(f"{where}: config: {reason}") from reason
-    return Row(
-        run=found.pop("cell"),
-        engine=found.pop("final.engine"),
-        final=float(found.pop("final.return_mean")),
-        returns=found.pop("final.returns"),
-        best=_field(data, "best.return_mean", where, (float,)) if found.pop("best") else None,
-        curve_steps=steps,
-        curve_returns=curve,
-        config=config,
-        **found,
-    )
 
 
-def _field(data: Any, path: str, where: str, kinds: tuple[type, ...] = ()) -> Any:
-    """Return the value at a path, lists as arrays [N] with NaN for null."""
-    for name in path.split("."):
-        if not isinstance(data, dict) or name not in data:
+def _field(data: Any, name: str, where: str) -> Any:
+    """Return the value of a field, lists as arrays [N] with NaN for null."""
+    path = PATHS.get(name, name)
+    kinds = get_args(_KINDS[name]) or (_KINDS[name],)
+    for part in path.split("."):
+        if data is None and NoneType in kinds:
+            return None
+        if not isinstance(data, dict) or part not in data:
             raise ConfigError(f"{where}: {path}: missing")
-        data = data[name]
-    kinds = kinds or FIELDS[path]
-    if float in kinds and type(data) in (int, float) and math.isfinite(data):
-        return data
-    if type(data) is list and list in kinds and all(_is_number(value) for value in data):
-        return np.array(data, float)
-    if type(data) in kinds and type(data) not in (float, list):
+        data = data[part]
+    if np.ndarray in kinds and type(data) is list:
+        if all(value is None or type(value) in (int, float) for value in data):
+            return np.array(data, float)
+    elif float in kinds and type(data) in (int, float):
+        if math.isfinite(data):
+            return float(data)
+    elif type(data) in kinds:
         return data
     raise ConfigError(f"{where}: {path}: must be {' or '.join(_NAMES[kind] for kind in kinds)}")
-
-
-def _is_number(value: Any) -> bool:
-    return value is None or type(value) in (int, float)
 
 
 class Published(NamedTuple):

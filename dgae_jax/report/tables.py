@@ -181,7 +181,7 @@ def number(value: float, form: str = "{:,.0f}") -> str:
 
 def spread(values: Sequence[float] | np.ndarray) -> str:
     """Format mean ± sample standard deviation."""
-    std = number(np.std(values, ddof=1)) if len(values) > 1 else NONE
+    std = number(float(np.std(values, ddof=1))) if len(values) > 1 else NONE
     return f"{number(float(np.mean(values)))} ± {std}"
 
 

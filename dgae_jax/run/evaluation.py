@@ -3,7 +3,7 @@
 import dataclasses
 import warnings
 from collections.abc import Callable
-from functools import lru_cache
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -17,7 +17,7 @@ from dgae_jax.learn import play
 from dgae_jax.learn.build import make_greedy, make_task, make_trainer
 from dgae_jax.learn.parallel import Trainer
 from dgae_jax.learn.types import InferenceState
-from dgae_jax.maths.statistics import bootstrap_interval, iqm
+from dgae_jax.maths.statistics import bootstrap_interval, iqm, sample_cvar
 from dgae_jax.run import checkpoint, files
 from dgae_jax.run.options import engine_of, eval_env_id
 from dgae_jax.run.runtime import Watch, compile_in_thread, unwatched
@@ -244,17 +244,12 @@ def summary(returns: np.ndarray) -> dict[str, Any]:
     return {
         "return_mean": float(returns.mean()),
         "return_std": float(returns.std()),
-        "return_cvar": {str(share): cvar(returns, share) for share in (0.05, 0.1, 0.25)},
+        "return_cvar": {str(share): sample_cvar(returns, share) for share in (0.05, 0.1, 0.25)},
         "return_quantiles": {
             str(q): float(np.quantile(returns, q)) for q in (0.05, 0.25, 0.5, 0.75, 0.95)
         },
         "returns": [round(float(r), 4) for r in returns],
     }
-
-
-def cvar(returns: np.ndarray, share: float) -> float:
-    """CVaR: the mean of the lowest `share` of returns [E], of one at least."""
-    return float(np.sort(returns)[: max(1, round(share * len(returns)))].mean())
 
 
 def seed_statistics(returns: list[np.ndarray]) -> dict[str, Any]:
@@ -264,13 +259,12 @@ def seed_statistics(returns: list[np.ndarray]) -> dict[str, Any]:
     bootstrap intervals over seeds, of the mean and of the interquartile mean. With few seeds they are too narrow.
     """
     means = np.array([each.mean() for each in returns])
-    key, ours = jax.random.key(0), jnp.asarray(means, jnp.float32)
     return {
         "seeds_mean": float(means.mean()),
         "seeds_std": float(means.std(ddof=1)),
-        "interval": [float(x) for x in bootstrap_interval(key, ours, jnp.mean)],
-        "iqm": float(iqm(ours)),
-        "iqm_interval": [float(x) for x in bootstrap_interval(key, ours)],
+        "interval": [float(x) for x in bootstrap_interval(means, partial(np.mean, axis=-1))],
+        "iqm": float(iqm(means)),
+        "iqm_interval": [float(x) for x in bootstrap_interval(means)],
     }
 
 

@@ -89,8 +89,8 @@ def good(tmp_path):
     ("argv", "sentence"),
     [
         ([], "error: STUDIES: must be the directory of one study or more (--help lists every flag)"),
-        (["{tmp}/none"], "error: {tmp}/none: must be the directory of a study; there is nothing"),
-        (["{tmp}"], "error: {tmp}: must be the directory of a study, with study.json and results.jsonl"),
+        (["{tmp}/none"], "error: {tmp}/none: must be the directory of a sweep; it does not exist"),
+        (["{tmp}"], "error: {tmp}: must be the directory of a sweep, with study.json and results.jsonl"),
         (["{good}", "--out", "{good}/study.json"], "error: --out {good}/study.json: must be a directory that can be written"),
         (["{good}", "--out", "{good}/study.json/x"], "error: --out {good}/study.json/x: must be a directory that can be written"),
         (["{good}", "--out", "x" * 300], f"error: --out {'x' * 300}: must be a directory that can be written (File name too long)"),
@@ -98,7 +98,7 @@ def good(tmp_path):
         (["{good}", "--markdown", "{tmp}/no.md"],
          "error: --markdown {tmp}/no.md: must be a file that can be read (No such file or directory)"),
         (["{good}", "--markdown", "{good}/study.json"], "error: --markdown {good}/study.json: must be a file with "
-         "<!-- dgae report: NAME --> and <!-- /dgae report --> on lines of their own"),
+         "each table between <!-- dgae report: NAME --> and <!-- /dgae report --> on lines of their own"),
         (["{good}", "{good}", "--markdown", "x"], "error: --markdown x: must be left out where several studies are compared"),
     ],
 )  # fmt: skip

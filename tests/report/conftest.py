@@ -1,4 +1,4 @@
-"""Groups of rows, as a report has them."""
+"""Groups of rows that were written and read."""
 
 import pytest
 
@@ -9,5 +9,4 @@ from tests.report.rows import study
 
 @pytest.fixture
 def grouped(tmp_path):
-    """The groups of rows that went through a file."""
     return lambda rows: groups_of(results.read(study(tmp_path / "grouped", rows)).rows)

@@ -1,23 +1,25 @@
-"""Groups and what is said of them."""
+"""Groups and their comparisons, against numbers worked out by hand and against SciPy."""
 
 import copy
 
 import numpy as np
 import pytest
+from scipy import stats
 
 from dgae_jax.report import analysis
+from dgae_jax.report.groups import common_curve
 from tests.report.rows import plain, row
 
 
-def with_setting(rows, **critic):
-    changed = copy.deepcopy(rows)
-    for each in changed:
+def changed(rows, **critic):
+    rows = copy.deepcopy(rows)
+    for each in rows:
         each["config"]["critic"] |= critic
-        each["hash"], each["cell"] = "another", "z" + each["cell"]
-    return changed
+        each["cell"] = "z" + each["cell"]
+    return rows
 
 
-def test_groups_come_by_task_and_algorithm_however_the_rows_finished(grouped):
+def test_groups_come_by_task_and_algorithm_in_any_order_of_rows(grouped):
     rows = [
         row("walker2d", "da2c"),
         row("hopper", "dppo", 1),
@@ -25,80 +27,99 @@ def test_groups_come_by_task_and_algorithm_however_the_rows_finished(grouped):
         row("hopper", "ppo"),
         row("hopper", "dppo", 0),
     ]
-    found = grouped(rows)
-    assert [(g.task, g.algo, [r.seed for r in g.rows]) for g in found] == [
-        ("ant-v4", "ppo", [0]), ("hopper-v4", "ppo", [0]), ("hopper-v4", "dppo", [0, 1]), ("walker2d-v4", "da2c", [0]),
-    ]  # fmt: skip
+    assert [(g.task, g.name, [r.seed for r in g.rows]) for g in grouped(rows)] == [
+        ("ant-v4", "PPO", [0]),
+        ("hopper-v4", "PPO", [0]),
+        ("hopper-v4", "DPPO", [0, 1]),
+        ("walker2d-v4", "DA2C", [0]),
+    ]
 
 
-def test_other_settings_of_an_algorithm_are_a_group_of_their_own_that_says_what_differs(grouped):
-    first, second = grouped(
-        [*plain([1, 2]), *with_setting(plain([5]), target="bellman", quantiles=8)]
-    )
-    assert (first.name, first.finals.tolist()) == ("DPPO", [1, 2])
-    assert (second.name, second.finals.tolist(), second.number) == (
-        "DPPO (critic.target bellman, critic.quantiles 8)",
-        [5],
-        1,
-    )
+def test_other_settings_are_a_group_named_by_the_differences(grouped):
+    wide = changed(plain([7, 5]), target="bellman", quantiles=8)
+    first, second = grouped([*plain([1, 2]), wide[1], wide[0]])
+    assert (first.name, first.number, first.finals.tolist()) == ("DPPO", 0, [1, 2])
+    assert (second.number, second.finals.tolist()) == (1, [7, 5])
+    assert second.name == "DPPO (critic.target bellman, critic.quantiles 8)"
 
 
-def test_groups_of_an_algorithm_stand_as_in_the_study_and_their_rows_by_seed(grouped):
-    wide, plainly = with_setting(plain([7, 8]), quantiles=8), plain([1, 2])
-    first, second = grouped([wide[1], wide[0], plainly[1], plainly[0]])
-    assert (first.finals.tolist(), second.finals.tolist()) == ([7, 8], [1, 2])
+def test_rows_of_two_schemas_share_a_group(grouped):
+    new, old = row(seed=0), row(seed=1)
+    old["config"] = {k: v for k, v in old["config"].items() if k != "num_steps"} | {
+        "horizon": new["config"]["num_steps"],
+        "schema": 2,
+    }
+    (group,) = grouped([new, old])
+    assert [each.seed for each in group.rows] == [0, 1]
 
 
-def test_the_pairs_are_the_papers():
+def test_pairs_are_the_papers():
     assert list(analysis.pairs()) == [("dppo", "ppo"), ("dtrpo", "trpo"), ("da2c", "a2c")]
 
 
-def test_improvement_is_told_per_task_and_over_the_tasks_that_have_both(grouped):
+def test_improvement_is_estimated_per_task_and_over_common_tasks(grouped):
     rows = (
         plain([1, 3], "hopper", "dppo")
         + plain([2, 2], "hopper", "ppo")
         + plain([9, 9], "ant", "dppo")
         + plain([1, 1], "ant", "ppo")
+        + plain([1, 2], "swimmer", "dppo")
     )
-    found = analysis.improvements(grouped(rows + plain([1, 2], "swimmer", "dppo")))
-    assert [(duel.task, duel.estimate.value) for duel in found] == [
-        ("ant-v4", 1.0),
-        ("hopper-v4", 0.5),
-        (analysis.ALL, 0.75),
-    ]
+    found = analysis.improvements(grouped(rows))
+    values = [(duel.task, duel.estimate.value) for duel in found]
+    assert values == [("ant-v4", 1.0), ("hopper-v4", 0.5), (analysis.ALL, 0.75)]
     np.testing.assert_array_equal(found[1].estimate.interval, [0, 1])
     assert analysis.improvements(grouped(plain([1, 3]))) == []
 
 
+def test_improvement_counts_ties_half_and_agrees_with_scipy():
+    generator = np.random.default_rng(5)
+    x, y = generator.normal(1.0, 0.3, (3, 10)).round(1), generator.normal(0.9, 0.3, (3, 8)).round(1)
+    won = np.mean([stats.mannwhitneyu(*both).statistic / 80 for both in zip(x, y, strict=True)])
+    found = analysis.improvement(list(x), list(y))
+    assert found.value == pytest.approx(won, rel=1e-14)
+    assert found.interval[0] < won < found.interval[1]
+
+
+def test_difference_is_second_minus_first_and_both_are_drawn():
+    found = analysis.difference(np.array([1.0, 3.0]), np.array([10.0, 10.0]))
+    assert found.value == 8
+    np.testing.assert_array_equal(found.interval, [7, 9])
+
+
+def test_single_seed_has_no_interval():
+    assert analysis.interquartile_mean(np.array([1.0])) == (1.0, None)
+    assert analysis.improvement([np.array([1.0, 2.0])], [np.array([1.0])]).interval is None
+
+
+def test_profile_is_the_share_of_seeds_above_each_score():
+    strata = [np.array([0.1, 0.5]), np.array([0.9])]
+    shares = analysis.performance_profile(strata, np.array([0.0, 0.1, 0.5, 0.95]))
+    np.testing.assert_allclose(shares, [1, 2 / 3, 1 / 3, 0])
+
+
 def test_scores_are_shares_of_the_best_mean_of_their_task(grouped):
-    scores = analysis.normalised(
-        grouped(
-            plain([1, 3], "hopper", "dppo")
-            + plain([1, 7], "hopper", "ppo")
-            + plain([-5], "ant", "ppo")
-        )
+    rows = (
+        plain([1, 3], "hopper", "dppo")
+        + plain([1, 7], "hopper", "ppo")  # the best mean is 4
+        + plain([-5], "ant", "ppo")  # no positive mean: no score
     )
-    assert {name: [s.tolist() for s in strata] for name, (_, strata) in scores.items()} == {
-        "PPO": [[0.25, 1.75]],  # the best mean is 4; Ant's best is negative
-        "DPPO": [[0.25, 0.75]],
-    }
+    scores = analysis.normalised(grouped(rows))
+    found = {name: [s.tolist() for s in strata] for name, (_, strata) in scores.items()}
+    assert found == {"PPO": [[0.25, 1.75]], "DPPO": [[0.25, 0.75]]}
 
 
-def test_samples_to_reach_are_those_of_the_mean_of_the_seeds(grouped):
+def test_samples_to_reach_are_those_of_the_mean_over_seeds(grouped):
     def curve(*values):
         return {"curve": {"steps": [10, 20, 30], "return": list(values)}}
 
-    slow = [
+    rows = [
         row("hopper", "ppo", 0, **curve(0, 4, 10)),
-        row("hopper", "ppo", 1, **curve(0, 8, 10)),
-    ]  # mean 0, 6, 10
-    groups = grouped(
-        [
-            *slow,
-            row("hopper", "dppo", 0, **curve(5, 8, 8)),
-            row("hopper", "a2c", 0, **curve(None, None, None)),
-        ]
-    )
+        row("hopper", "ppo", 1, **curve(0, 8, 10)),  # mean 0, 6, 10
+        row("hopper", "dppo", 0, **curve(5, 8, 8)),
+        row("hopper", "a2c", 0, **curve(None, None, None)),
+    ]
+    groups = grouped(rows)
     best = analysis.best_mean(groups)
     assert best == 10
     assert {g.name: analysis.reached(g, best) for g in groups} == {
@@ -106,8 +127,28 @@ def test_samples_to_reach_are_those_of_the_mean_of_the_seeds(grouped):
         "DPPO": [10, None],
         "A2C": [None, None],
     }
+    for none in (None, -3.0, 0.0):
+        assert analysis.reached(groups[0], none) == [None, None]
 
 
-@pytest.mark.parametrize("best", [None, -3.0, 0.0])
-def test_shares_of_a_best_that_is_not_positive_are_not_reached(grouped, best):
-    assert analysis.reached(grouped([row()])[0], best) == [None, None]
+def test_curves_are_interpolated_at_the_steps_that_all_cover():
+    one = np.array([10.0, 20, 30, 40]), np.array([np.nan, 2, 3, 4])
+    two = np.array([15.0, 25, 35]), np.array([0.0, 10, 20])
+    steps, values = common_curve([one, two])
+    np.testing.assert_array_equal(steps, [20, 25, 30, 35])  # one's first value to two's last
+    np.testing.assert_array_equal(values, [[2, 2.5, 3, 3.5], [5, 10, 15, 20]])
+
+
+def test_curves_without_values_or_common_steps_are_empty():
+    steps, none = np.array([1.0, 2]), np.array([np.nan, np.nan])
+    assert common_curve([(steps, none)])[1].shape == (0, 0)
+    assert common_curve([(steps, none), (steps, steps)])[1].tolist() == [[1, 2]]
+    at, values = common_curve([(steps, steps), (steps + 5, steps)])
+    assert (at.size, values.size) == (0, 0)
+
+
+def test_many_steps_are_thinned_and_the_first_and_last_stay():
+    steps = np.arange(1.0, 1001)
+    at, values = common_curve([(steps, steps**2)])
+    assert (len(at), at[0], at[-1]) == (200, 1, 1000)
+    np.testing.assert_array_equal(values[0], at**2)

@@ -1,21 +1,24 @@
-"""The page, parsed as HTML."""
+"""The page, parsed as HTML, and in a browser where there is one."""
 
 import base64
+import json
 import re
+import shutil
+import subprocess
 from html.parser import HTMLParser
 
 import pytest
 
 from dgae_jax.report import results
-from dgae_jax.report.page import PARTS, page
-from dgae_jax.report.published import Published
+from dgae_jax.report.page import page
+from dgae_jax.report.results import Published
 from tests.report.rows import plain, row, study, whole
 
 VOID = {"meta", "img", "br", "link", "input", "hr"}
 
 
 class Reader(HTMLParser):
-    """Tags with their attributes, text, and whether every tag is closed in its turn."""
+    """Tags with their attributes, and words; every tag must be closed in its turn."""
 
     def __init__(self, text):
         super().__init__()
@@ -31,10 +34,13 @@ class Reader(HTMLParser):
         assert self.open.pop() == tag
 
     def handle_data(self, data):
-        self.words.append(data)
+        self.words += [" ".join(data.split())] if data.strip() else []
 
     def all(self, tag):
         return [attributes for name, attributes in self.tags if name == tag]
+
+    def values(self, *names):
+        return [each[name] for _, each in self.tags for name in names if name in each]
 
     def text_of(self, tag):
         return re.findall(rf"<{tag}\b[^>]*>([^<]*)", self.source)
@@ -42,140 +48,141 @@ class Reader(HTMLParser):
 
 @pytest.fixture
 def read(tmp_path):
-    """The page of rows, and its parts."""
+    """The page of rows."""
 
-    def read(*studies):
-        named = [study(tmp_path / f"study-{number}", rows) for number, rows in enumerate(studies)]
-        text = page([results.read(path) for path in named])
-        return text, Reader(text)
+    def read(*sweeps, published=()):
+        named = [study(tmp_path / f"sweep-{number}", rows) for number, rows in enumerate(sweeps)]
+        return Reader(page([results.read(path) for path in named], published))
 
     return read
 
 
-def test_the_page_needs_no_other_file_and_no_script(read):
-    text, found = read(whole(("hopper", "ant"), ("ppo", "dppo"), 2))
+def test_page_needs_no_other_file_and_its_links_lead_to_headings(read):
+    found = read(whole(("hopper",), ("ppo", "dppo"), 2))
     assert not {"script", "link", "iframe", "object", "embed"} & {tag for tag, _ in found.tags}
-    sources = [
-        attributes[name]
-        for _, attributes in found.tags
-        for name in ("src", "href", "srcset", "poster")
-        if name in attributes
-    ]
-    assert len(sources) > 5
+    assert not re.search(r"@import|url\(", found.source)
+    sources = found.values("src", "href", "srcset", "poster")
     assert all(source.startswith(("data:", "#")) for source in sources)
-    assert not re.search(r"@import|url\(", text)
+    ids = found.values("id")
+    assert len(ids) == len(set(ids))
+    links = {link["href"] for link in found.all("a")}
+    assert len(links) == 8
+    assert links <= {f"#{each}" for each in ids}
 
 
-def test_links_lead_to_headings_and_identities_are_there_once(read):
-    _, found = read(whole(("hopper",), ("ppo", "dppo"), 2))
-    identities = [attributes["id"] for _, attributes in found.tags if "id" in attributes]
-    assert len(identities) == len(set(identities))
-    links = [attributes["href"][1:] for attributes in found.all("a")]
-    assert len(links) == len(PARTS)  # all but the videos, and the deviations
-    assert set(links) <= set(identities)
-
-
-def test_pictures_are_whole_and_say_what_they_show(read):
-    _, found = read(plain([1000, 2000], algo="ppo") + plain([3000, 3100], algo="dppo"))
-    pictures = found.all("img")
-    for picture in pictures:
+def test_pictures_are_whole_and_their_alternative_texts_have_the_numbers(read):
+    found = read(plain([1000, 2000], algo="ppo") + plain([3000, 3100], algo="dppo"))
+    for picture in found.all("img"):
         kind, data = picture["src"].split(",")
         assert kind == "data:image/svg+xml;base64"
         assert base64.b64decode(data).rstrip().endswith(b"</svg>")
-    alts = [picture["alt"] for picture in pictures]
-    assert "Final returns on hopper-v4: PPO 1,500, DPPO 3,050." in alts
-    assert "Probability of improvement: DPPO over PPO on hopper-v4 1.00." in alts
-    assert all(alts)
+    returns, curves, improvement, *_ = found.values("alt")
+    assert returns == "Final returns on hopper-v4: PPO 1,500, DPPO 3,050."
+    assert re.search(r"Learning curves on hopper-v4; .*: PPO [\d,]+, DPPO [\d,]+\.$", curves)
+    assert improvement == "Probability of improvement: DPPO over PPO on hopper-v4 1.00."
 
 
-def test_what_comes_from_outside_is_escaped(read):
+def test_content_of_files_is_escaped(read):
     evil = '<script>alert("x")</script>'
-    fields = dict.fromkeys(("cell", "env", "command", "git_revision"), evil)
-    more = {
-        "machine": {evil: evil},
-        "versions": {evil: evil},
-        "config": {evil: {"a": evil}},
-        "env_version": None,
-    }
-    text, found = read([row() | fields | more])
-    assert "<script" not in text
+    written = row() | dict.fromkeys(("cell", "env", "command", "git_revision"), evil)
+    written |= {"machine": {evil: evil}, "versions": {evil: evil}, "env_version": None}
+    written["config"] |= {evil: {"a": evil}}
+    found = read([written])
+    assert "<script" not in found.source
     assert evil in "".join(found.words)
 
 
-def test_settings_that_differ_from_the_first_of_the_algorithm_are_highlighted(read):
+def test_settings_that_differ_from_the_first_of_the_algorithm_are_marked(read):
     first = row("hopper", "ppo")
     policy = first["config"]["policy"] | {"initial_std": 3.0}
-    changed = {
-        "env": "walker2d",
-        "num_envs": 7,
-        "num_steps": 9,
-        "gamma": 0.5,
-        "lam": 0.25,
-        "policy": policy,
-    }
-    _, found = read(
-        [
-            first,
-            row("walker2d", "ppo") | {"config": first["config"] | changed},
-            row("swimmer", "dppo"),
-        ]
-    )
-    assert found.text_of("mark") == ["walker2d", "7", "9", "0.5", "0.25", "3.0"]
+    changed = {"env": "walker2d", "num_envs": 7, "gamma": 0.5, "policy": policy}
+    second = row("walker2d", "ppo", config=first["config"] | changed)
+    found = read([first, second, row("swimmer", "dppo")])
+    assert found.text_of("mark") == ["walker2d", "7", "0.5", "3.0"]
 
 
-def test_every_command_is_there_with_versions_and_machines(read):
-    rows = whole(("hopper",), ("ppo",), 3)
-    text, found = read(rows)
-    assert [each["command"] in text for each in rows] == [True] * 3
+def test_commands_versions_and_machines_are_listed(read):
+    rows = whole(("hopper",), ("ppo",), 2)
+    found = read(rows)
+    (commands,) = found.text_of("pre")
+    assert all(each["command"] in commands for each in rows)
     assert {"jax", "0.10.2", "machine: device", "git revision"} <= set(found.words)
 
 
-def test_cells_without_a_result_are_named(tmp_path):
-    path = study(tmp_path / "some", [row()], planned=["hopper-dppo-1", "hopper-dppo-2"])
-    assert "Cells without a result: hopper-dppo-1, hopper-dppo-2." in page([results.read(path)])
+def test_summary_counts_runs_and_names_those_without_a_result(tmp_path):
+    diverged = row(seed=1, final={"engine": "jax", "return_mean": None, "returns": [None]})
+    path = study(tmp_path / "some", [row(), diverged], planned=["hopper-dppo-2"])
+    (summary,) = re.findall("<p>(.*?)</p>", page([results.read(path)]), re.DOTALL)
+    numbers = "1 trained run:\n1 task,\n1 algorithm,\n1 seed,\n1,000,000 environment steps each."
+    assert numbers in summary
+    assert "hopper-dppo-2." in summary
+    assert "seed 1 of hopper-dppo-1." in summary
 
 
-def test_one_seed_has_dashes_for_intervals_and_one_algorithm_no_pairs(read):
-    _, found = read([row()])
-    assert (
-        "1 trained run: 1 task, 1 algorithm, 1 seed, 1,000,000 environment steps each."
-        in found.words
-    )
+def test_single_algorithm_has_no_pairs_and_no_link_to_them(read):
+    found = read([row()])
     assert any(word.endswith("[–]") for word in found.words)
     assert "Probability of improvement" not in found.words
 
 
-def test_a_video_of_a_task_is_in_the_page(tmp_path):
-    path = study(
-        tmp_path / "films",
-        [row(), row("ant"), row() | {"env": "brax:ant", "env_version": None, "cell": "b"}],
-    )
+def test_video_of_a_task_is_embedded(tmp_path):
+    brax = row() | {"env": "brax:ant", "env_version": None, "cell": "b"}
+    path = study(tmp_path / "videos", [row(), row("ant"), brax])
     (path / "videos").mkdir()
     for name in ("hopper", "brax-ant"):
         (path / "videos" / f"{name}.mp4").write_bytes(name.encode())
-    films = Reader(page([results.read(path)])).all("video")
-    assert [
-        base64.b64decode(film["src"].removeprefix("data:video/mp4;base64,")) for film in films
-    ] == [b"hopper", b"brax-ant"]
-
-
-def test_published_results_are_listed_with_their_sources(tmp_path):
-    known = [
-        Published("hopper", 10**6, "PPO", 2609.0, 701.0, 10, "Tianshou"),
-        Published("ant", 10**6, "PPO", 3258.0, None, None, "Other"),
+    sources = [video["src"] for video in Reader(page([results.read(path)])).all("video")]
+    prefix = "data:video/mp4;base64,"
+    assert [base64.b64decode(src.removeprefix(prefix)) for src in sources] == [
+        b"hopper",
+        b"brax-ant",
     ]
-    words = Reader(page([results.read(study(tmp_path / "one", [row()]))], known)).words
-    assert words[words.index("2,609 ± 701") : words.index("Tianshou") + 1] == [
-        "2,609 ± 701",
-        "10",
-        "Tianshou",
-    ]
-    assert "Other" not in words  # a task that the study does not have
 
 
-def test_two_studies_are_compared_first_and_then_told_one_after_the_other(read):
-    _, found = read(plain([1000, 3000]), plain([4000, 4000]))
-    assert found.text_of("h2") == ["Comparison", "study-0", "study-1", "Deviations from the paper"]
+def test_published_results_of_its_tasks_are_listed_with_their_sources(read):
+    hopper = Published("hopper", 10**6, "PPO", 2609.0, 701.0, 10, "Tianshou")
+    ant = Published("ant", 10**6, "PPO", 3258.0, None, None, "Other")
+    words = read([row()], published=[hopper, ant]).words
+    end = words.index("Tianshou")
+    assert words[end - 2 : end] == ["2,609 ± 701", "10"]
+    assert "Other" not in words
+
+
+def test_sweeps_are_compared_first(read):
+    found = read(plain([1000, 3000]), plain([4000, 4000]))
+    assert found.text_of("h2") == ["Comparison", "sweep-0", "sweep-1", "Deviations from the paper"]
     assert "+2,000 [+1,000, +3,000]" in found.words
-    identities = [attributes["id"] for _, attributes in found.tags if "id" in attributes]
-    assert len(identities) == len(set(identities))
+    ids = found.values("id")
+    assert len(ids) == len(set(ids))
+    assert {link["href"][1:] for link in found.all("a")} <= set(ids)
+
+
+NAMES = ("chromium", "chromium-browser", "google-chrome", "chrome")
+CHROMIUM = next(filter(None, map(shutil.which, NAMES)), None)
+
+FRAME = """<!DOCTYPE html><body>
+<iframe src="page.html" style="width: 390px; height: 844px; border: 0" onload="
+  const page = this.contentDocument, root = page.documentElement;
+  const broken = [...page.images].filter(image => !image.naturalWidth).length;
+  document.body.dataset.seen = JSON.stringify([root.clientWidth, root.scrollWidth, broken]);
+"></iframe></body>"""
+"""A frame can be as narrow as a phone; a window cannot."""
+
+
+@pytest.mark.skipif(CHROMIUM is None, reason="no chromium is on the PATH")
+def test_page_fits_a_phone_and_the_console_is_silent(read, tmp_path):
+    text = read(whole(("ant", "hopper"), seeds=2)).source.replace("<details>", "<details open>")
+    (tmp_path / "page.html").write_text(text)
+    (tmp_path / "frame.html").write_text(FRAME)
+    argv = "--headless --no-sandbox --disable-gpu --hide-scrollbars --allow-file-access-from-files"
+    argv += f" --user-data-dir={tmp_path}/profile --enable-logging=stderr --dump-dom"
+    command = [
+        CHROMIUM,
+        *argv.split(),
+        "--virtual-time-budget=5000",
+        f"{tmp_path.as_uri()}/frame.html",
+    ]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=120, check=True)
+    seen = json.loads(re.findall(r'data-seen="([^"]*)"', done.stdout)[0])
+    assert seen == [390, 390, 0]
+    assert "CONSOLE" not in done.stderr

@@ -9,7 +9,7 @@ import pytest
 
 from dgae_jax.cli import calibrate
 from dgae_jax.maths.transport import quantile_midpoints
-from dgae_jax.report import calibration as picture
+from dgae_jax.report import figures
 from dgae_jax.run import calibration, directory, training
 from tests import helpers, runs
 
@@ -142,8 +142,8 @@ def test_the_command_writes_the_statistics_of_every_run_and_a_picture(
 
 
 def test_what_is_said_of_coverage_is_a_share_where_there_are_enough_quantiles():
-    assert picture.held({"coverage_90": 0.874}) == "87 % of the returns in the central 90 %"
+    assert figures.coverage({"coverage_90": 0.874}) == "87 % of the returns in the central 90 %"
     assert (
-        picture.held(calibration.statistics(UNIFORM[..., :9], RETURNS))
+        figures.coverage(calibration.statistics(UNIFORM[..., :9], RETURNS))
         == "fewer than 10 quantiles have no central 90 %"
     )
