@@ -111,15 +111,8 @@ def test_a_seventh_row_joins_the_table_and_trains(tables, monkeypatch):
     assert distance(before.policy.params, after.policy.params) > 0
 
 
-WRONG = [
-    ({"gamma": 1.5}, "gamma 1.5: must be a number from 0 to 1"),
-    ({"gamma": "0.9"}, "gamma: must be float, not '0.9'"),
-    ({"critic.target": "foo"}, "critic.target foo: must be one of bellman"),
-]
-
-
-@pytest.mark.parametrize(("change", "message"), WRONG)
-def test_the_python_api_refuses_an_invalid_configuration(change, message, tmp_path):
+def test_the_python_api_refuses_an_invalid_configuration(tmp_path):
+    change, message = {"gamma": 1.5}, "gamma 1.5: must be a number from 0 to 1"
     config, env = dg.Config().replace(**change), probes.Target()
     with pytest.raises(dg.ConfigError, match=f"^{message}"):
         dg.make_algorithm("dppo", env, config)
@@ -175,8 +168,3 @@ def test_floats_are_swept_in_one_compiled_program():
 
     slow, fast = moved(jnp.array([1e-4, 1e-2]), jnp.array([0.9, 0.99]))
     assert 10 * slow < fast
-
-
-def test_traced_values_pass_unchecked_and_the_rest_is_checked():
-    with pytest.raises(dg.ConfigError, match="num_steps 0"):
-        jax.jit(lambda gamma: dg.resolve(dg.Config(gamma=gamma, num_steps=0)))(0.5)

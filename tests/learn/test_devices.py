@@ -4,54 +4,72 @@ import os
 import subprocess
 import sys
 
+import jax
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
+import dgae_jax as dg
 from dgae_jax.learn import devices
-from tests.helpers import ROOT
+from dgae_jax.learn.build import make_trainer, seed_keys
+from tests.helpers import ROOT, small
 
 
 @pytest.fixture(scope="module")
 def found(tmp_path_factory):
     file = tmp_path_factory.mktemp("shared") / "runs.npz"
+    program = [sys.executable, "-m", "tests.learn.test_devices", file]
     environment = {**os.environ, "JAX_PLATFORMS": "cpu"}
-    done = subprocess.run(
-        [sys.executable, "-m", "tests.learn.shared_run", file],
-        cwd=ROOT,
-        env=environment,
-        capture_output=True,
-        text=True,
-        timeout=300,
-    )
-    assert done.returncode == 0, done.stderr
+    subprocess.run(program, cwd=ROOT, env=environment, check=True, timeout=300)
     return np.load(file)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("count", [2, 4])
-@pytest.mark.parametrize("algo", ["dppo", "dtrpo"])
-def test_after_ten_iterations_the_networks_are_those_of_one_device_up_to_rounding(
-    algo, count, found
-):
-    assert_allclose(found[f"{algo} {count}"], found[f"{algo} 1"], atol=1e-5)
-    assert_allclose(found[f"{algo} {count} reward"], found[f"{algo} 1 reward"], atol=1e-5)
-    assert np.abs(found[f"{algo} 1"] - found[f"{algo} start"]).max() > 1e-3
+@pytest.mark.parametrize(
+    ("shared", "single"),
+    [
+        *((f"{algo} 1 {count}", f"{algo} 1 1") for algo in ("dppo", "dtrpo") for count in (2, 4)),
+        ("dppo gradients", "dppo 1 1"),  # each minibatch is shared, as on accelerators
+        ("dtrpo gradients", "dtrpo 1 1"),
+        ("dppo 4 4", "dppo 4 1"),  # seeds are divided
+        ("dppo 3 4", "dppo 3 1"),  # seeds do not divide, and envs are
+    ],
+)
+def test_shared_runs_are_those_of_one_device_up_to_rounding(shared, single, found):
+    assert_allclose(found[shared], found[single], atol=1e-5)
+    if single == "dppo 1 1":
+        assert np.abs(found[single] - found["dppo start"]).max() > 1e-3
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("algo", ["dppo", "dtrpo"])
-def test_devices_that_share_each_minibatch_as_accelerators_do_find_the_same(algo, found):
-    assert_allclose(found[f"{algo} gradients"], found[f"{algo} 1"], atol=1e-5)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("seeds", [4, 3])
-def test_seeds_are_divided_between_devices_or_their_worlds_are_and_find_the_same(seeds, found):
-    assert_allclose(found[f"{seeds} seeds 4"], found[f"{seeds} seeds 1"], atol=1e-5)
-
-
-def test_a_device_alone_shares_with_nobody():
+def test_a_single_device_shares_nothing():
     assert devices.make_mesh(1) is None
     assert devices.count() == 1
     assert devices.divided(len, (0,), None) is len
+
+
+def trained(algo, seeds, count, iterations=10):
+    """Parameters after ten iterations and their rewards, on so many devices."""
+    config = dg.resolve(small(algo, num_envs=8, num_steps=16, num_seeds=seeds))
+    env = dg.make_env("hopper", physics="native")
+    trainer = make_trainer(env, 10, devices.make_mesh(count))
+    state = trainer.init(config, seed_keys(config))
+    state, rows = trainer.dispatch(config, state, iterations)
+    assert len(state.episodes.total.sharding.device_set) == count
+    numbers = state.policy.params, state.critic.params, rows["reward"]
+    return np.concatenate([x.ravel() for x in jax.tree.leaves(numbers)])
+
+
+def main(file):
+    devices.divide_cpu(4)
+    found = {"dppo start": trained("dppo", 1, 1, iterations=0)}
+    runs = [(algo, 1, count) for algo in ("dppo", "dtrpo") for count in (1, 2, 4)]
+    for run in [*runs, ("dppo", 4, 1), ("dppo", 4, 4), ("dppo", 3, 1), ("dppo", 3, 4)]:
+        found["{} {} {}".format(*run)] = trained(*run)
+    devices.concurrently = lambda *tasks: tuple(f(*args) for f, args in tasks)  # as accelerators
+    for algo in ("dppo", "dtrpo"):
+        found[f"{algo} gradients"] = trained(algo, 1, 4)
+    np.savez(file, **found)
+
+
+if __name__ == "__main__":
+    main(sys.argv[1])
