@@ -4,15 +4,11 @@ import dataclasses
 import hashlib
 import importlib
 import json
-import re
-import subprocess
 import tempfile
 from pathlib import Path
 
-import imageio_ffmpeg
 import jax
 import jax.numpy as jnp
-import numpy as np
 
 import dgae_jax as dg
 from dgae_jax.envs.gym_tasks import Ant, Hopper, Swimmer, Walker2d
@@ -60,27 +56,6 @@ def signed(arrays):
         + b"\n"
         + arrays
     )
-
-
-def film_of(path):
-    """The frames [F, H, W, 3] of a video, and its frames per second."""
-    program = [
-        imageio_ffmpeg.get_ffmpeg_exe(),
-        "-i",
-        str(path),
-        "-fps_mode",
-        "passthrough",
-        "-f",
-        "rawvideo",
-        "-pix_fmt",
-        "rgb24",
-        "-",
-    ]
-    done = subprocess.run(program, capture_output=True, check=True)
-    width, height, fps = re.search(
-        r"Video: .*?, (\d+)x(\d+).*? ([\d.]+) fps", done.stderr.decode()
-    ).groups()
-    return np.frombuffer(done.stdout, np.uint8).reshape(-1, int(height), int(width), 3), float(fps)
 
 
 def distance(a, b):

@@ -9,6 +9,7 @@ import pytest
 
 import dgae_jax as dg
 from dgae_jax.configs.resolved import resolve
+from dgae_jax.export import gl
 from dgae_jax.learn.types import InferenceState
 from dgae_jax.run import checkpoint
 from dgae_jax.run.training import train
@@ -77,3 +78,10 @@ def make_untrained(name, directory):
     networks = checkpoint.Networks(*states, file)
     checkpoint.save_networks(file, config, networks, np.full(config.num_seeds, 2.0))
     return Untrained(name, config, config.num_seeds - 1, file, networks)
+
+
+@pytest.fixture(scope="session")
+def opengl():
+    """Skip where nothing can be drawn."""
+    if not any(gl.works(backend) for backend in gl.CANDIDATES):
+        pytest.skip(f"neither {' nor '.join(gl.CANDIDATES)} works here")

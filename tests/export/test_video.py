@@ -1,0 +1,283 @@
+"""Videos: from episodes to frames, from frames to files, and `dgae render`."""
+
+import dataclasses
+import re
+import shutil
+import subprocess
+import sys
+import warnings
+
+import gymnasium
+import imageio_ffmpeg
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose, assert_array_equal
+from PIL import Image, ImageSequence
+
+from dgae_jax.export import encoding, overlay, video
+from dgae_jax.export.overlay import Episode, Overlay, density, shorten
+from dgae_jax.export.video import Actor, play, side_by_side, states_shown, tile
+from dgae_jax.run.evaluation import episode_seeds
+from tests.export.conftest import make_untrained
+from tests.helpers import ROOT
+from tests.runs import QUIET, small
+
+
+class Constant:
+    """A policy that holds one action, with a critic of four crossing quantiles."""
+
+    def __init__(self, action):
+        self.action = np.array(action, np.float32)
+
+    def __call__(self, obs):
+        return self.action
+
+    def quantiles(self, obs):
+        return np.broadcast_to(np.array([3.0, 1.0, 4.0, 2.0], np.float32), (len(obs), 4))
+
+
+def actor(env="hopper", action=(0.1, -0.2, 0.3), **changes):
+    settings = {"env": env, "gamma": 0.9, "episode_length": 1000, **changes}
+    config = dataclasses.replace(small("dppo"), **settings)
+    return Actor("name", Constant(action), config, reward_std=2.0)
+
+
+def gymnasiums_own(env, action, seed, steps):
+    """Rewards and positions of the same episode."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        env = gymnasium.make(env, max_episode_steps=10_000)
+    env.reset(seed=seed)
+    rewards, qpos = [], []
+    for _ in range(steps):
+        qpos.append(env.unwrapped.data.qpos.copy())
+        _, reward, terminated, _, _ = env.step(np.array(action, np.float32))
+        rewards.append(reward)
+        if terminated:
+            break
+    env.close()
+    return np.array(rewards), np.array(qpos)
+
+
+def returns_of(rewards, gamma, count):
+    """Discounted returns from the first states, of rewards divided by 2."""
+    return [sum(gamma**k * r for k, r in enumerate(rewards[t:])) / 2 for t in range(count)]
+
+
+def test_episode_that_falls_is_the_one_of_gymnasium():
+    seed = int(episode_seeds(3, 1)[0])
+    episode = play(actor(), seed, 10.0)
+    rewards, qpos = gymnasiums_own("Hopper-v4", (0.1, -0.2, 0.3), seed, 1000)
+    assert episode.fell
+    assert 5 < len(rewards) < 1000
+    assert_array_equal(episode.qpos, qpos)
+    assert_allclose(episode.total, np.cumsum(rewards) - rewards)
+    assert_allclose(episode.discounted, returns_of(rewards, 0.9, len(rewards)), rtol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("gamma", "limit", "shown", "followed"),
+    [(0.9, 1000, 10, 44), (0.999, 100, 1, 4603)],  # the first k with gamma**k <= 1 %
+)
+def test_returns_are_followed_beyond_the_states_shown(gamma, limit, shown, followed):
+    playing = actor("swimmer", (0.5, -0.5), gamma=gamma, episode_length=limit)
+    episode = play(playing, 7, shown * 0.04 + 1e-6)
+    rewards, qpos = gymnasiums_own("Swimmer-v4", (0.5, -0.5), 7, shown + followed)
+    assert (len(episode.qpos), episode.dt, episode.fell) == (shown, 0.04, False)
+    assert_array_equal(episode.qpos, qpos[:shown])
+    assert_allclose(episode.discounted, returns_of(rewards, gamma, shown), rtol=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("metric", "value"), [("mean", 2.5), ("cvar:0.5", 1.5), ("cvar:0.25", 1.0)]
+)
+def test_quantiles_are_sorted_and_valued_by_the_risk_measure(metric, value):
+    episode = play(actor(metric=metric), 7, 0.1)
+    assert_array_equal(episode.quantiles, [[1, 2, 3, 4]] * len(episode.qpos))
+    assert_allclose(episode.value, value)
+
+
+def test_all_policies_play_the_initial_states_of_an_evaluation(monkeypatch):
+    monkeypatch.setattr(video, "play", lambda *played: played)
+    first, second = (int(seed) for seed in episode_seeds(5, 2))
+    scenes = list(video._play_all(["a", "b"], video.Clip(2, 5, 1.0)))
+    assert scenes == [[(name, seed, 1.0) for name in "ab"] for seed in (first, second)]
+
+
+def test_a_frame_shows_the_last_state_that_has_begun():
+    assert states_shown(10, dt=0.1, fps=5) == [0, 2, 4, 6, 9]
+    assert states_shown(4, dt=0.05, fps=40) == [0, 0, 1, 1, 2, 2, 3, 3]
+    assert states_shown(1000, dt=0.008, fps=25)[-2:] == [990, 999]
+    assert states_shown(1, dt=0.008, fps=25) == states_shown(1, dt=0.05, fps=20) == [0]
+
+
+def noise(count, size=(48, 64)):
+    random = np.random.default_rng(0)
+    return [random.integers(0, 255, (*size, 3), np.uint8) for _ in range(count)]
+
+
+def test_a_column_that_has_ended_stands_still():
+    short, long = noise(2), noise(4)
+    rows = list(side_by_side([iter(short), iter(long)], hold=2))
+    assert_array_equal([row[:, :64] for row in rows], [short[0], *[short[1]] * 5])
+    assert_array_equal([row[:, 64:] for row in rows], [*long, long[3], long[3]])
+
+
+def test_more_than_three_robots_stand_in_a_square():
+    panels = [np.full((2, 2, 3), level, np.uint8) for level in (1, 2, 3, 4, 5)]
+    assert tile(panels[:3])[0, :, 0].tolist() == [1, 1, 2, 2, 3, 3]
+    assert tile(panels[:4])[::2, ::2, 0].tolist() == [[1, 2], [3, 4]]
+    assert tile(panels)[::2, ::2, 0].tolist() == [[1, 2, 3], [4, 5, 255]]
+
+
+def read_video(path):
+    """Frames [F, H, W, 3] of an MP4, and its frames per second."""
+    command = [imageio_ffmpeg.get_ffmpeg_exe(), "-i", path, "-f", "rawvideo"]
+    done = subprocess.run([*command, "-pix_fmt", "rgb24", "-"], capture_output=True, check=True)
+    stream = re.search(r"Video: .*?, (\d+)x(\d+).*? ([\d.]+) fps", done.stderr.decode())
+    width, height, fps = map(float, stream.groups())
+    return np.frombuffer(done.stdout, np.uint8).reshape(-1, int(height), int(width), 3), fps
+
+
+def length(path):
+    """Of a GIF, which may join frames that stand still [ms]."""
+    with Image.open(path) as gif:
+        return sum(frame.info["duration"] for frame in ImageSequence.Iterator(gif))
+
+
+@pytest.mark.parametrize("fps", [10, 25])
+def test_files_have_the_frames_and_the_speed_given(fps, tmp_path):
+    picture = np.zeros((48, 64, 3), np.uint8)
+    picture[:, :32] = (0, 114, 178)
+    pictures = [np.roll(picture, 4 * i, axis=1) for i in range(10)]
+    paths = encoding.write(iter(pictures), tmp_path / "a.b", ("mp4", "gif"), fps)
+    assert paths == [tmp_path / "a.b.mp4", tmp_path / "a.b.gif"]
+    assert sorted(tmp_path.iterdir()) == sorted(paths)
+    frames, speed = read_video(paths[0])
+    assert (frames.shape, speed) == ((10, 48, 64, 3), fps)
+    assert np.abs(frames.astype(int) - pictures).mean() < 8
+    assert length(paths[1]) == pytest.approx(10_000 / fps, abs=50)
+    with Image.open(paths[1]) as gif:
+        assert (gif.size, gif.info["loop"]) == ((64, 48), 0)
+        assert np.abs(np.asarray(gif.convert("RGB")).astype(int) - pictures[0]).mean() < 8
+
+
+def test_no_frames_and_a_missing_directory_are_errors(tmp_path):
+    with pytest.raises(ValueError, match="at least one frame"):
+        encoding.write([], tmp_path / "video", ("mp4",), 25)
+    with pytest.raises(OSError, match="No such file"):
+        encoding.write(noise(2), tmp_path / "nowhere" / "video", ("gif",), 25)
+
+
+SPREAD = np.linspace(0, 4, 64)
+
+
+def episode_of(quantiles, metric="mean", fell=False):
+    """Three states; the return that followed rises from the lowest to the highest quantile."""
+    z = np.sort(np.asarray(quantiles, float))
+    return Episode(
+        title="name",
+        config=dataclasses.replace(small("dppo"), metric=metric),
+        dt=0.5,
+        fell=fell,
+        qpos=np.zeros((3, 6)),
+        qvel=np.zeros((3, 6)),
+        total=np.array([0.0, 10.0, 1234.0]),
+        quantiles=np.stack([z, z + 1, z + 2]),
+        value=z.mean() + np.arange(3.0),
+        discounted=np.linspace(z.min(), z.max() + 2, 3),
+    )
+
+
+def columns_of(picture, color):
+    """Columns of an overlay that hold about this color, below the legend."""
+    rgb = np.array([int(overlay.COLORS[color][i : i + 2], 16) for i in (1, 3, 5)])
+    return np.flatnonzero((np.abs(picture[45:95].astype(int) - rgb).max(-1) < 40).any(0))
+
+
+@pytest.mark.parametrize("width", [160, 480])
+def test_overlay_moves_and_depends_on_the_state_alone(width):
+    drawn = Overlay(episode_of(SPREAD), width)
+    pictures = [drawn.render(t) for t in range(3)]
+    assert {picture.shape for picture in pictures} == {(overlay.HEIGHT, width, 3)}
+    assert not np.array_equal(pictures[0], pictures[1])
+    assert_array_equal(drawn.render(0), pictures[0])
+    at = [columns_of(picture, "vermilion") for picture in pictures]
+    assert at[0].max() < at[1].min() <= at[1].max() < at[2].min()
+
+
+def test_overlay_tells_at_the_last_state_that_the_robot_fell():
+    standing, fallen = (Overlay(episode_of(SPREAD, fell=fell), 480) for fell in (False, True))
+    same = [np.array_equal(standing.render(t), fallen.render(t)) for t in range(3)]
+    assert same == [True, True, False]
+
+
+def test_rug_shows_the_weights_of_the_risk_measure():
+    neutral, averse, scalar = (
+        columns_of(Overlay(episode_of(z, metric), 480).render(1), "blue")
+        for z, metric in ((SPREAD, "mean"), (SPREAD, "cvar:0.25"), ([2.0], "mean"))
+    )
+    assert np.ptp(averse) == pytest.approx(0.25 * np.ptp(neutral), abs=0.06 * np.ptp(neutral))
+    assert averse.min() == neutral.min()
+    assert len(scalar) == 0
+
+
+def test_density_has_mass_one_and_the_moments_of_the_quantiles():
+    x = np.linspace(-10, 14, 4000)
+    y, step = density(SPREAD, x), x[1] - x[0]
+    bandwidth = 1.06 * SPREAD.std() * 64**-0.2
+    moments = [(f * y).sum() * step for f in (1, x, (x - 2) ** 2)]
+    assert_allclose(moments, [1, 2, SPREAD.var() + bandwidth**2], rtol=1e-4)
+    assert np.isfinite(density(np.zeros(8), x)).all()
+
+
+def test_a_long_title_loses_its_middle():
+    assert shorten("short", 12) == "short"
+    assert shorten("hopper-dppo-16x128-0", 11) == "hoppe…128-0"
+
+
+WIDTH, HEIGHT, FPS = 200, 120, 25
+
+
+def render(*argv):
+    """`dgae render` in a process of its own, which has OpenGL."""
+    size = ["--width", WIDTH, "--height", HEIGHT, "--cache-dir", QUIET.cache_dir]
+    done = subprocess.run(
+        [sys.executable, "experiments/render.py", *map(str, [*argv, *size])],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        timeout=300,
+    )
+    assert (done.returncode, done.stderr) == (0, "")
+    return done.stdout
+
+
+def test_video_of_two_runs_side_by_side(trained, tmp_path, opengl):
+    scalar = make_untrained("scalar", tmp_path).file
+    out = tmp_path / "out"
+    out.mkdir()
+    said = render(trained, "--compare", scalar, "--episodes", 2, "--out", out / "v.mp4")
+    assert re.findall(r"written to (.*) \(.* MB\)\n", said) == [f"{out}/v.mp4", f"{out}/v.gif"]
+    frames, fps = read_video(out / "v.mp4")
+    states = 20  # the small run's episodes are truncated there: 4 frames, and 15 at the end of each
+    count = 2 * (int(states * 0.008 * FPS) + 15)
+    assert (fps, frames.shape) == (FPS, (count, HEIGHT + overlay.HEIGHT, 2 * WIDTH, 3))
+    robot, below = frames[:, :HEIGHT, :WIDTH].astype(int), frames[:, HEIGHT:].astype(int)
+    assert np.abs(robot[3] - robot[0]).max() > 60
+    assert np.abs(below[3] - below[0]).max() > 60
+    assert np.abs(robot[10] - robot[9]).mean() < 2
+    pale = 0.6 * np.array([0x56, 0xB4, 0xE9]) + 0.4 * 255
+    is_pale = np.abs(below[0, 45:95] - pale).max(-1) < 40
+    assert is_pale[:, :WIDTH].sum() > 100
+    assert is_pale[:, WIDTH:].sum() == 0
+    assert length(out / "v.gif") == pytest.approx(19 * 80, abs=80)
+
+
+def test_video_of_all_checkpoints_and_of_a_policy_file(trained, tmp_path, opengl):
+    run_dir = shutil.copytree(trained, tmp_path / "run")
+    assert len(list((run_dir / "checkpoints").iterdir())) == 2
+    render(run_dir, "--during", "--format", "gif")
+    assert length(run_dir / "video-during.gif") == pytest.approx(19 * 80, abs=80)
+    render(make_untrained("quantile", tmp_path).file, "--format", "gif")
+    assert length(tmp_path / "quantile-video.gif") > 0
