@@ -14,7 +14,7 @@ from dgae_jax.cli import parse, reproduce, train
 from dgae_jax.cli.main import COMMANDS, command
 from dgae_jax.configs.algorithms import ALGORITHMS
 from dgae_jax.configs.config import ConfigError
-from dgae_jax.configs.serial import to_dict
+from dgae_jax.configs.serial import SCHEMA, to_dict
 from dgae_jax.learn.build import TABLES
 from dgae_jax.maths.risk import METRICS
 from dgae_jax.report import markdown, results
@@ -130,14 +130,15 @@ def test_commands_make_the_configurations_of_the_results(study):
         if name == "reproduce" and words[0] == f"results/{study}":
             made |= {run.name: to_dict(run.config) for run in reproduce.parsed(words)[1]}
     rows = results.read(ROOT / "results" / study).rows
-    expected = {row.cell: row.config for row in rows}
+    expected = {row.run: row.config | {"schema": SCHEMA} for row in rows}
     assert {name: json.loads(json.dumps(made.get(name))) for name in expected} == expected
 
 
 def test_committed_policies_know_their_configuration():
     for row in results.read(ROOT / "results" / "tuned").rows:
-        policy = ROOT / "results" / "tuned" / "policies" / f"{row.cell}.msgpack"
-        assert json.loads(json.dumps(to_dict(directory.read_config(policy)))) == row.config
+        policy = ROOT / "results" / "tuned" / "policies" / f"{row.run}.msgpack"
+        config = row.config | {"schema": SCHEMA}
+        assert json.loads(json.dumps(to_dict(directory.read_config(policy)))) == config
 
 
 def test_configuration_page_equals_the_dataclasses():

@@ -192,8 +192,8 @@ def performance_profile(groups: Iterable[Group]) -> Figure:
             _line(axes, group, taus, analysis.performance_profile(strata, taus), markevery=20)
             if ends is not None:
                 _shade(axes, group, taus, *ends)
-        axes.set(title="Performance profile", xlabel="return / best mean of the task (τ)")
-        axes.set(ylabel="share of runs above τ", ylim=(-0.03, 1.03))
+        axes.set(title="Performance profile", xlabel="normalised score τ")
+        axes.set(ylabel="share of runs above τ", ylim=(-0.02, 1.02))
         axes.yaxis.set_major_formatter(PercentFormatter(1))
         _legend(figure, [axes])
     return figure
