@@ -90,7 +90,7 @@ def _refit(arguments: Arguments, config: ResolvedConfig, out: Path) -> int:
         "which": arguments.checkpoint,
         "index": arguments.index,
         "seed": arguments.seed,
-        "worlds": arguments.worlds,
+        "num_envs": arguments.worlds,
     }
     with Reporter() as reporter:
         found = calibration.refit(arguments.run_dir, config, **how, watch=reporter.watch)

@@ -1,4 +1,4 @@
-"""The returns that came: episodes of the policy as it acts while training, each followed until further rewards do not count."""
+"""Calibration of a critic against Monte Carlo returns, and critics that are fitted to them."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -12,114 +12,90 @@ from jaxtyping import Array, Float, Key
 from dgae_jax.configs.config import CriticConfig, invalid
 from dgae_jax.configs.resolved import ResolvedConfig, resolve
 from dgae_jax.envs.base import has_limit
-from dgae_jax.learn.build import make_policy, make_quantiles, make_task
+from dgae_jax.learn.build import make_quantiles, make_task
 from dgae_jax.learn.diagnostics import SIMILAR, similar_means
-from dgae_jax.learn.iteration import sampler
 from dgae_jax.learn.networks import Network, value_network
 from dgae_jax.learn.normalizers import normalize
-from dgae_jax.learn.rollout import Episodes, rollout, start
-from dgae_jax.learn.types import InferenceState, Params, TrainableState, Transition
+from dgae_jax.learn.types import InferenceState, Params, TrainableState
 from dgae_jax.learn.updates import minibatch_update
 from dgae_jax.maths.returns import bellman_target, lambda_sum
 from dgae_jax.maths.statistics import coverage, crps, pit
 from dgae_jax.maths.transport import quantile_huber_loss, quantile_midpoints
 from dgae_jax.run import checkpoint
 from dgae_jax.run.checkpoint import Networks
+from dgae_jax.run.episodes import sampled_steps
 from dgae_jax.run.runtime import Watch, compile_in_thread, unwatched
 
-CHUNK = 100
-"""Steps between looks at signals and clock."""
-
-LEFT_OUT = 0.01
-"""Weight γᵏ of the first reward that the return from a state leaves out, unless the episode ends before."""
+NEGLIGIBLE = 0.01
+"""Weight γᵏ below which rewards are left out of a return."""
 
 MAX_RETURN_STEPS = 50_000
 """Most steps that a return is followed for."""
 
+NUM_ENVS = 64
+"""Envs side by side in a calibration."""
+
+SHARES = (SIMILAR, 0.03, 0.01, 0.003)
+"""Shares of W₁ up to which |d| counts as that of similar means."""
+
+BINS = 20
+"""Bins of the histogram of the probability integral transform."""
+
+PASSES, LEARNING_RATE = 20, 1e-3
+"""Passes over all returns, and Adam's rate at the start, which decays to zero."""
+
+KAPPA = 1e-4
+"""κ of the quantile Huber loss in standard deviations; near 0 its minimizers are quantiles."""
+
 
 class MonteCarlo(NamedTuple):
-    """What N worlds showed of a policy in T steps, through which its episodes go on without a time limit."""
+    """T steps in N envs without a time limit, and the returns that followed."""
 
     obs: Float[Array, "T N O"]
     reward: Float[Array, "T N"]
     discount: Float[Array, "T N"]
     """γ, and 0 where the episode ended."""
-    outcome: Float[Array, "T N"]
-    """The discounted return from each state on, of rewards as they are."""
+    returns: Float[Array, "T N"]
+    """Discounted sum of the unscaled rewards from each step on."""
 
 
 def steps_that_count(gamma: float) -> int:
-    """How many rewards of a return have a weight γᵏ above `LEFT_OUT`, at most `LONGEST`."""
-    return int(np.count_nonzero(gamma ** np.arange(MAX_RETURN_STEPS) > LEFT_OUT))
+    """Return how many rewards of a return weigh more than `NEGLIGIBLE`."""
+    return int(np.count_nonzero(gamma ** np.arange(MAX_RETURN_STEPS) > NEGLIGIBLE))
 
 
 def check_returns(config: ResolvedConfig) -> None:
-    """Raise ConfigError where returns cannot be followed to their end: γ is too near 1, or the task cuts episodes short itself."""
+    """Raise ConfigError where returns have no end: γ near 1, or a time limit of the task."""
     if steps_that_count(config.gamma) == MAX_RETURN_STEPS:
-        raise invalid(
-            "gamma",
-            config.gamma,
-            f"at most {LEFT_OUT ** (1 / MAX_RETURN_STEPS):.4f}, so that returns can be followed to their end",
-        )
+        limit = f"at most {NEGLIGIBLE ** (1 / MAX_RETURN_STEPS):.4f}, so that returns end"
+        raise invalid("gamma", config.gamma, limit)
     if has_limit(make_task(config)):
-        raise invalid(
-            "env", config.env, "a task without a time limit of its own, which cuts returns short"
-        )
+        raise invalid("env", config.env, "a task without a time limit of its own")
 
 
 def monte_carlo(
     policy: InferenceState,
     config: ResolvedConfig,
     key: Key[Array, ""],
-    worlds: int,
+    num_envs: int,
     watch: Watch = unwatched,
 ) -> MonteCarlo:
-    """The outcomes of one policy in as many worlds, over `episode_length` steps, rounded up to whole chunks.
+    """Sample returns of a stochastic policy over `episode_length` steps, in whole chunks.
 
-    Actions are drawn from the policy. Raises as `check`.
+    Each return is followed until further rewards do not count. Raises as `check_returns`.
     """
     check_returns(config)
-    env = make_task(config)
-    network = make_policy(env, config)
-
-    @jax.jit
-    @jax.default_matmul_precision("highest")  # as in training
-    def go_on(
-        policy: InferenceState, episodes: Episodes, keys: jax.Array
-    ) -> tuple[Episodes, Transition]:
-        return rollout(env, sampler(network, policy), episodes, keys, episode_length=2**30)
-
-    begin, draw = jax.random.split(key)
-    episodes, seen, paid = (
-        jax.jit(lambda keys: start(env, keys))(jax.random.split(begin, worlds)),
-        [],
-        [],
-    )
-    length = -(-(config.episode_length + steps_that_count(config.gamma)) // CHUNK)
-    keys = jax.random.split(draw, (length, CHUNK, worlds))
-    compile_in_thread(go_on, policy, episodes, keys[0], watch=watch, what="compiling")
-    for i in range(length):
-        watch(f"playing step {i * CHUNK:,} of {length * CHUNK:,} in {worlds} worlds")
-        episodes, step = go_on(policy, episodes, keys[i])
-        seen += [step.obs] if i * CHUNK < config.episode_length else []
+    length = config.episode_length + steps_that_count(config.gamma)
+    seen, paid, done = [], [], 0
+    for step in sampled_steps(policy, config, key, num_envs, length, watch):
+        if done < config.episode_length:
+            seen.append(step.obs)
         paid.append((step.reward, config.gamma * (1.0 - step.terminated)))
-    obs, (reward, discount) = (
-        jnp.concatenate(seen),
-        (jnp.concatenate(part) for part in zip(*paid, strict=True)),
-    )
-    return MonteCarlo(
-        obs, *(x[: len(obs)] for x in (reward, discount, lambda_sum(reward, discount)))
-    )
-
-
-WORLDS = 64
-"""Worlds side by side."""
-
-SHARES = (SIMILAR, 0.03, 0.01, 0.003)
-"""Of W₁, up to which |d| counts as that of similar means."""
-
-BINS = 20
-"""Of the histogram of the probability integral transform."""
+        done += len(step.reward)
+    obs = jnp.concatenate(seen)
+    reward, discount = (jnp.concatenate(part) for part in zip(*paid, strict=True))
+    returns = lambda_sum(reward, discount)
+    return MonteCarlo(obs, *(x[: len(obs)] for x in (reward, discount, returns)))
 
 
 def calibrate(
@@ -131,80 +107,91 @@ def calibrate(
     seed: int = 0,
     watch: Watch = unwatched,
 ) -> dict[str, Any]:
-    """Statistics of the critic of a run, or in a file, over the `outcomes` of `WORLDS` worlds, actions drawn from the policy.
+    """Compute how well a critic's distribution describes Monte Carlo returns.
 
-    Returns are of scaled rewards, as the critic's: `coverage_90` is the share of them inside the central 90 % of the quantiles,
-    `crossing` the share of neighbouring quantiles in the wrong order, `bias` and `rmse` those of the mean, `spread` the mean standard
-    deviation of the quantiles, `crps` the continuous ranked probability score, `pit` the share of returns in each of `BINS` equal
-    parts of probability, `similar_means` the shares of steps whose target and prediction have similar means for their shapes
-    (`similar`). Raises as `outcomes.play`, `restore.trained` and `restore.reward_std`.
+    Args:
+        source: a run directory or a policy file.
+        config: its configuration.
+        which: latest or best.
+        index: the seed among those trained side by side.
+        seed: seed of the episodes.
+        watch: told the progress.
+
+    Returns:
+        `calibration_statistics`, of returns of scaled rewards, and `similar_mean_shares`.
+
+    Raises:
+        ConfigError: as `check_returns`.
+        CheckpointError: as `checkpoint.load_networks` and `checkpoint.reward_std`.
     """
     found = checkpoint.load_networks(source, config, which)
     policy, critic = jax.tree.map(lambda x: x[index], (found.policy, found.critic))
     std = float(checkpoint.reward_std(found.path, config)[index])
-    came = monte_carlo(policy, config, jax.random.key(seed), WORLDS, watch)
+    came = monte_carlo(policy, config, jax.random.key(seed), NUM_ENVS, watch)
     quantiles = jax.jit(make_quantiles(make_task(config), config))(critic, came.obs)
-    about = {"checkpoint": found.path.name, "samples": came.outcome.size}
-    similar_means = similar(came.reward / std, came.discount, quantiles)
-    return {**about, **statistics(quantiles, came.outcome / std), "similar_means": similar_means}
+    shares = similar_mean_shares(came.reward / std, came.discount, quantiles)
+    return {
+        "checkpoint": found.path.name,
+        "samples": came.returns.size,
+        **calibration_statistics(quantiles, came.returns / std),
+        "similar_means": shares,
+    }
 
 
-def statistics(quantiles: jax.Array, outcome: jax.Array) -> dict[str, Any]:
-    """Of quantiles [T, N, K] and the returns [T, N] that came."""
-    error, probability = (
-        np.asarray(quantiles.mean(-1) - outcome),
-        np.asarray(pit(quantiles, outcome)),
-    )
+def calibration_statistics(quantiles: jax.Array, returns: jax.Array) -> dict[str, Any]:
+    """Compare quantiles [T, N, K] with the returns [T, N] that came.
+
+    Returns:
+        `coverage_90`, share of returns inside the central 90 %; `crossing`, share of neighbouring
+        quantiles in the wrong order; `bias` and `rmse` of the mean; `spread`, mean standard
+        deviation of the quantiles; `crps`, continuous ranked probability score; `pit`, histogram
+        of the probability integral transform.
+    """
+    error = np.asarray(quantiles.mean(-1) - returns)
     falls = jnp.diff(quantiles) < 0
     found = {
-        "coverage_90": coverage(quantiles, outcome, 0.9),
+        "coverage_90": coverage(quantiles, returns, 0.9),
         "crossing": falls.mean() if falls.size else 0.0,
         "bias": error.mean(),
         "rmse": np.sqrt((error**2).mean()),
         "spread": quantiles.std(-1).mean(),
-        "crps": crps(quantiles, outcome).mean(),
+        "crps": crps(quantiles, returns).mean(),
     }
+    probability = np.asarray(pit(quantiles, returns))
     bins = np.histogram(probability, BINS, (0, 1))[0] / probability.size
-    return {
-        **{name: round(float(value), 6) for name, value in found.items()},
-        "pit": [round(float(share), 6) for share in bins],
-    }
+    numbers = {name: round(float(value), 6) for name, value in found.items()}
+    return {**numbers, "pit": [round(float(share), 6) for share in bins]}
 
 
-def similar(reward: jax.Array, discount: jax.Array, quantiles: jax.Array) -> dict[str, float]:
-    """By each of `SHARES`, the share of steps [T − 1, N] with |d(r + γG′, G)| ≤ share · W₁(r + γG′, G) (Sec. results)."""
+def similar_mean_shares(
+    reward: jax.Array, discount: jax.Array, quantiles: jax.Array
+) -> dict[str, float]:
+    """Return shares of steps [T − 1, N] with |d(r + γG′, G)| ≤ share · W₁(r + γG′, G)."""
     before, after = quantiles[:-1], quantiles[1:]
     target = bellman_target(reward[: len(before)], discount[: len(before)], after)
-    return {
-        str(share): round(float(similar_means(target, before, share).mean()), 6) for share in SHARES
-    }
 
+    def portion(share: float) -> float:
+        return round(float(similar_means(target, before, share).mean()), 6)
 
-PASSES, LEARNING_RATE = 20, 1e-3
-"""Over all returns, and Adam's rate at the start, which falls to zero."""
-
-KAPPA = 1e-4
-"""Of the quantile-Huber loss, in standard deviations of the returns: near 0 its minimisers are quantiles."""
+    return {str(share): portion(share) for share in SHARES}
 
 
 class Samples(NamedTuple):
-    """What a distribution is fitted to."""
+    """Normalized observations and scaled returns that a distribution is fitted to."""
 
     obs: Float[Array, "B O"]
-    """Normalised."""
-    outcome: Float[Array, " B"]
-    """Scaled."""
+    returns: Float[Array, " B"]
 
 
 class Refitted(NamedTuple):
-    """A policy as it was with a critic that was fitted to it, as `restore.save_networks` takes them."""
+    """A policy with a critic that was fitted to it, as `checkpoint.save_networks` takes them."""
 
     config: ResolvedConfig
     networks: Networks
     std: Float[Array, "1"]
-    """What rewards are divided by."""
+    """Scale of the rewards."""
     returns: int
-    """How many it was fitted to."""
+    """Number of returns it was fitted to."""
 
 
 def refit(
@@ -214,37 +201,33 @@ def refit(
     which: str,
     index: int = 0,
     seed: int = 0,
-    worlds: int = 128,
+    num_envs: int = 128,
     watch: Watch = unwatched,
 ) -> Refitted:
-    """The policy of a run, or of a file, with a `sorted` critic whose outputs were fitted to its `outcomes` in so many worlds.
+    """Fit a `sorted` critic to Monte Carlo returns of a policy that is held fixed.
 
-    Returns are scaled by their standard deviation. Raises as `outcomes.play` and `restore.trained`.
+    Quantile regression (Koenker & Bassett 1978) without bootstrapping. Returns are scaled by
+    their standard deviation. Arguments and errors as `calibrate`.
     """
     check_returns(config)
     found = checkpoint.load_networks(source, config, which)
     policy = jax.tree.map(lambda x: x[index], found.policy)
-    play_key, fit_key = jax.random.split(
-        jax.random.key(seed)
-    )  # not the episodes of `calibrate` with the same seed
-    came = monte_carlo(policy, config, play_key, worlds, watch)
-    spread = came.outcome.std()
+    play_key, fit_key = jax.random.split(jax.random.key(seed))  # not the episodes of `calibrate`
+    came = monte_carlo(policy, config, play_key, num_envs, watch)
+    spread = came.returns.std()
     std = jnp.where(spread > 0, spread, 1.0)
-    samples = Samples(
-        normalize(policy.obs_stats, came.obs).reshape(came.outcome.size, -1),
-        (came.outcome / std).ravel(),
-    )
-    config = _of_one(config, index)
+    obs = normalize(policy.obs_stats, came.obs).reshape(came.returns.size, -1)
+    samples = Samples(obs, (came.returns / std).ravel())
+    config = _refitted_config(config, index)
     network = initial_network(samples, config.critic.outputs, config.critic.hidden)
-    params = fit_quantiles(network, samples, len(came.outcome), fit_key, watch)
-    policy, critic = jax.tree.map(
-        lambda x: x[None], (policy, InferenceState(params, policy.obs_stats))
-    )
-    return Refitted(config, Networks(policy, critic, found.path), std[None], came.outcome.size)
+    params = fit_quantiles(network, samples, len(came.returns), fit_key, watch)
+    states = policy, InferenceState(params, policy.obs_stats)
+    policy, critic = jax.tree.map(lambda x: x[None], states)
+    return Refitted(config, Networks(policy, critic, found.path), std[None], came.returns.size)
 
 
-def _of_one(config: ResolvedConfig, index: int) -> ResolvedConfig:
-    """The configuration of the run with that index alone, and of a `sorted` critic of rewards that are scaled."""
+def _refitted_config(config: ResolvedConfig, index: int) -> ResolvedConfig:
+    """Return the configuration of one seed, with a `sorted` critic of scaled rewards."""
     written = config.as_config()
     critic = CriticConfig(
         kind="sorted",
@@ -257,8 +240,8 @@ def _of_one(config: ResolvedConfig, index: int) -> ResolvedConfig:
 
 
 def initial_network(samples: Samples, quantiles: int, hidden: Sequence[int]) -> Network:
-    """A network that begins near the quantiles of all samples: with γ near 1 they are far from 0 beside their spread."""
-    bias = jnp.quantile(samples.outcome, quantile_midpoints(quantiles))
+    """Return a network that starts near the quantiles of all returns, which may be far from 0."""
+    bias = jnp.quantile(samples.returns, quantile_midpoints(quantiles))
     return value_network(samples.obs.shape[-1], quantiles, hidden=hidden, bias=bias)
 
 
@@ -269,33 +252,32 @@ def fit_quantiles(
     key: Key[Array, ""],
     watch: Watch = unwatched,
 ) -> Params:
-    """The parameters with which the network's outputs are quantiles of the samples, after `PASSES` over them.
+    """Fit the network's outputs to quantiles of the samples, in `PASSES` over them.
 
-    A pass takes `minibatches` gradient steps. The outputs are fitted as they are and not sorted, which is as good and takes about half
-    of the time.
+    The outputs are not sorted during the fit: as good, in half the time.
+
+    Args:
+        network: the network.
+        samples: what to fit.
+        minibatches: gradient steps per pass.
+        key: random key.
+        watch: told the progress.
     """
 
-    def loss(params: Params, samples: Samples):
-        quantiles = network.apply(params, samples.obs)
-        return (
-            quantile_huber_loss(quantiles, samples.outcome[:, None], kappa=KAPPA) / KAPPA
-        ).mean(), {}
+    def loss(params: Params, batch: Any):
+        quantiles = network.apply(params, batch.obs)
+        value = quantile_huber_loss(quantiles, batch.returns[:, None], kappa=KAPPA) / KAPPA
+        return value.mean(), {}
 
-    how = {
-        "optimizer": "adam",
-        "learning_rate": LEARNING_RATE,
-        "learning_rate_end": 0.0,
-        "max_grad_norm": 0.5,
-    }
-    update = minibatch_update(loss, PASSES, epochs=1, minibatches=minibatches, **how)
+    rates = {"learning_rate": LEARNING_RATE, "learning_rate_end": 0.0, "max_grad_norm": 0.5}
+    how: dict[str, Any] = {"optimizer": "adam", **rates, "epochs": 1, "minibatches": minibatches}
+    update = minibatch_update(loss, PASSES, **how)
     begin, *keys = jax.random.split(key, 1 + PASSES)
     params = network.init(begin)
-    fit, step = (
-        TrainableState(params, update.init(params)),
-        jax.jit(jax.default_matmul_precision("highest")(update.step)),
-    )
-    compile_in_thread(step, keys[0], fit, samples, watch=watch)
+    state = TrainableState(params, update.init(params))
+    step = jax.jit(jax.default_matmul_precision("highest")(update.step))
+    compile_in_thread(step, keys[0], state, samples, watch=watch)
     for done, each in enumerate(keys):
         watch(f"fitting, pass {done + 1} of {PASSES}")
-        fit, _ = jax.block_until_ready(step(each, fit, samples))
-    return fit.params
+        state, _ = jax.block_until_ready(step(each, state, samples))
+    return state.params

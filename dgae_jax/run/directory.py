@@ -1,21 +1,17 @@
-"""The directory of a run.
+"""The run directory and its manifest.
 
-`config.json`, `manifest.json`, `metrics.jsonl`, `evaluations.jsonl`, `checkpoints/`, `curve.png`, and at the end `evaluation.json`.
+It holds `config.json`, `manifest.json`, `metrics.jsonl`, `evaluations.jsonl`, `checkpoints/`,
+`curve.png`, and at the end `evaluation.json`. Importing this module does not import JAX.
 """
 
 import contextlib
-import errno
 import fcntl
-import glob
 import importlib.metadata
 import json
-import os
 import platform
-import shutil
 import stat
 import subprocess
 import sys
-import tempfile
 import time
 from collections.abc import Callable, Iterator
 from functools import cache
@@ -25,9 +21,17 @@ from typing import IO, Any
 from dgae_jax.configs.config import ConfigError, invalid
 from dgae_jax.configs.resolved import ResolvedConfig, resolve
 from dgae_jax.configs.serial import from_dict, to_dict
-from dgae_jax.run import files, terminal
-from dgae_jax.run.options import RunOptions, read_options
-from dgae_jax.run.options import saved_options as options_to_save
+from dgae_jax.run import files, options, terminal
+from dgae_jax.run.options import RunOptions
+
+VERSIONED = (
+    "dgae_jax", "jax", "jaxlib", "flax", "optax", "brax", "mujoco", "mujoco-mjx", "playground",
+    "gymnasium", "numpy",
+)  # fmt: skip
+"""Packages whose versions are recorded."""
+
+OWN_DIRECTORIES = ("checkpoints", "nonfinite", "tensorboard", "wandb", "mlflow")
+OWN_FILES = ("config.json", "manifest.json", "metrics.jsonl", "evaluations.jsonl", "sinks.json")
 
 
 class InUseError(ConfigError):
@@ -35,201 +39,140 @@ class InUseError(ConfigError):
 
 
 def default_path(config: ResolvedConfig) -> Path:
-    """runs/ENV-ALGO-SEED-TIME below the working directory."""
-    return (
-        Path("runs")
-        / f"{config.env.replace('/', '_')}-{config.algo}-{config.seed}-{time.strftime('%Y%m%d-%H%M%S')}"
-    )
+    """Return runs/ENV-ALGO-SEED-TIME below the working directory."""
+    name = f"{config.env.replace('/', '_')}-{config.algo}-{config.seed}"
+    return Path("runs") / f"{name}-{time.strftime('%Y%m%d-%H%M%S')}"
 
 
-def create(path: Path, config: ResolvedConfig, options: RunOptions) -> None:
-    """Make a new run directory, whole at once, and write what the run is.
+@contextlib.contextmanager
+def created(path: Path, config: ResolvedConfig, options: RunOptions) -> Iterator[None]:
+    """Make a new run directory and hold it.
 
-    It is built beside, hidden, and moved to its place in one step; what earlier attempts that were killed left there is removed.
-    In a directory that exists and is empty `config.json` is written last: without it the directory still counts as empty.
-    Raises ConfigError, and writes nothing, if the directory holds anything else or cannot be written.
+    `config.json` is written last: without it a directory counts as empty, and no run has begun.
+
+    Raises:
+        ConfigError: the directory holds anything else, or cannot be written.
     """
     try:
-        if path.exists():
-            if not _is_empty(path):
-                raise _used(path)
-            _fill(path, config, options)
-            return
-        path.parent.mkdir(parents=True, exist_ok=True)
-        _clean(path)
-        with _sibling(path) as sibling:
-            _fill(sibling, config, options)
-            _move(sibling, path)
-        files.sync_directory(path.parent)
+        path.mkdir(parents=True, exist_ok=True)
+        _check_empty(path)
     except OSError as reason:
-        raise invalid(
-            "run_dir", path, f"a directory that can be written ({reason.strerror})"
-        ) from reason
+        allowed = f"a directory that can be written ({reason.strerror})"
+        raise invalid("run_dir", path, allowed) from reason
+    with locked(path):
+        _check_empty(path)  # again: another process may have been quicker
+        try:
+            (path / "checkpoints").mkdir(exist_ok=True)
+            files.write_json(path / "manifest.json", {**_part(options), "resumed": []})
+            write_config(path, config)
+        except OSError as reason:
+            allowed = f"a directory that can be written ({reason.strerror})"
+            raise invalid("run_dir", path, allowed) from reason
+        yield
 
 
-def _used(path: Path) -> ConfigError:
-    return invalid("run_dir", path, "a new or empty directory")
-
-
-def _move(made: Path, path: Path) -> None:
-    try:
-        made.rename(path)
-    except OSError as reason:
-        if reason.errno in (errno.ENOTEMPTY, errno.EEXIST):  # another process was quicker
-            raise _used(path) from reason
-        raise
+def _check_empty(path: Path) -> None:
+    """Refuse a directory that holds more than `created` leaves when it is killed."""
+    left = {"manifest.json", "manifest.json.part", "config.json.part"}
+    for each in path.iterdir():
+        unused = each.name == "metrics.jsonl" and not each.is_symlink() and not each.stat().st_size
+        empty = each.name == "checkpoints" and not each.is_symlink() and not any(each.iterdir())
+        if not (each.name in left or unused or empty):
+            raise invalid("run_dir", path, "a new or empty directory")
 
 
 def has_begun(path: Path) -> bool:
-    """Whether a run was made at `path`, so that it can be resumed; not where that cannot be seen."""
+    """Return whether a run was made at `path`, so that it can be resumed."""
     try:
         return (path / "config.json").exists()
-    except OSError:  # the name is too long, or lies behind a directory that may not be read
+    except OSError:  # a name that is too long, or a directory that may not be read
         return False
-
-
-def _is_empty(path: Path) -> bool:
-    """Whether there is nothing but what `_fill` leaves when it is killed."""
-    return path.is_dir() and all(
-        each.name in ("manifest.json", "manifest.json.part", "config.json.part")
-        or (
-            each.name == "checkpoints"
-            and each.is_dir()
-            and not each.is_symlink()
-            and not any(each.iterdir())
-        )
-        for each in path.iterdir()
-    )
-
-
-def _fill(path: Path, config: ResolvedConfig, options: RunOptions) -> None:
-    (path / "checkpoints").mkdir(exist_ok=True)
-    write_manifest(path, options)
-    write_config(path, config)
-
-
-@contextlib.contextmanager
-def _sibling(path: Path) -> Iterator[Path]:
-    """A hidden directory beside `path`, locked while it is filled, and gone afterwards if it was not moved."""
-    made = Path(tempfile.mkdtemp(prefix=f".{path.name}.", suffix=".part", dir=path.parent))
-    with _held(made):
-        try:
-            made.chmod(0o777 & ~_umask())
-            yield made
-        finally:
-            shutil.rmtree(made, ignore_errors=True)
-
-
-def _clean(path: Path) -> None:
-    """Remove the siblings that no process holds any more."""
-    for left in path.parent.glob(f".{glob.escape(path.name)}.*.part"):
-        with contextlib.suppress(OSError), _held(left):
-            shutil.rmtree(left)
-
-
-@contextlib.contextmanager
-def _held(path: Path) -> Iterator[None]:
-    """Lock a directory; raises OSError if another process holds it, or if there are no locks here."""
-    descriptor = os.open(path, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW)
-    try:
-        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        yield
-    finally:
-        os.close(descriptor)
-
-
-def _umask() -> int:
-    """Of this process, which can only be seen by setting it."""
-    mask = os.umask(0o077)
-    os.umask(mask)
-    return mask
 
 
 @contextlib.contextmanager
 def locked(path: Path) -> Iterator[None]:
-    """Hold the run directory, by its metrics; raises ConfigError if another process does. The lock ends with the process."""
+    """Hold the run directory, by its metrics; the lock ends with the process.
+
+    Raises:
+        InUseError: another process trains there.
+        ConfigError: the directory cannot be written.
+    """
     try:
         file = (path / "metrics.jsonl").open("a")
     except OSError as reason:
-        raise ConfigError(
-            f"{path}: must be a directory that can be written ({reason.strerror})"
-        ) from reason
+        must = f"must be a directory that can be written ({reason.strerror})"
+        raise ConfigError(f"{path}: {must}") from reason
     with file:
         hold(file, InUseError(f"{path}: must not be in use; another process is training there"))
         yield
 
 
 def hold(file: IO, in_use: ConfigError) -> None:
-    """Lock an open file until it is closed; raises `in_use` if another process holds it."""
+    """Lock an open file until it is closed; raise `in_use` if another process holds it."""
     try:
         fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError:
         raise in_use from None
     except OSError as reason:  # some network file systems have no locks
-        terminal.warn(
-            f"warning: {file.name} cannot be locked ({reason.strerror}): train in it with one process only"
-        )
+        why = f"cannot be locked ({reason.strerror}): use it with one process only"
+        terminal.warn(f"warning: {file.name} {why}")
 
 
 def config_of(source: Path) -> ResolvedConfig:
-    """The configuration of a run directory, or of the file of a policy; raises ConfigError if it is neither.
+    """Return the configuration of a run directory, or of a policy file, for which JAX is imported.
 
-    JAX is loaded for a file only, and MuJoCo never, which a film must do without until its OpenGL is chosen.
+    Raises:
+        ConfigError: `source` is neither.
     """
-    if not _kind(source, Path.is_file):
+    if not _is(source, Path.is_file):
         return read_config(source)
     from dgae_jax.run import checkpoint
 
     return checkpoint.config_of(source)
 
 
-def _kind(path: Path, test: Callable[[Path], bool]) -> bool:
+def read_config(path: Path) -> ResolvedConfig:
+    """Return the configuration of a run directory.
+
+    Raises:
+        ConfigError: `path` is no run directory, or has links or devices in it.
+    """
+    if not _is(path, Path.is_dir):
+        there = "a file" if path.exists() else "nothing"
+        raise ConfigError(f"{path}: must be a run directory; there is {there} of that name")
+    for name in OWN_DIRECTORIES:
+        _check_own(path / name, "directory", stat.S_ISDIR)
+    with contextlib.suppress(OSError):  # what cannot be read is missed below
+        for file in [*(path / name for name in OWN_FILES), *path.glob("checkpoints/steps_*")]:
+            _check_own(file, "file", stat.S_ISREG)
+    return read_config_file(path / "config.json")
+
+
+def _is(path: Path, test: Callable[[Path], bool]) -> bool:
     try:
         return test(path)
     except OSError as reason:
-        raise ConfigError(
-            f"{path}: must be a run directory, or the file of a policy ({reason.strerror})"
-        ) from reason
-
-
-def read_config(path: Path) -> ResolvedConfig:
-    """The configuration of a run; raises ConfigError if `path` is not a run directory, or one with links or devices in it."""
-    if not _kind(path, Path.is_dir):
-        raise ConfigError(
-            f"{path}: must be a run directory; there is {'a file' if path.exists() else 'nothing'} of that name"
-        )
-    for name in ("checkpoints", "nonfinite", "tensorboard", "wandb", "mlflow"):
-        _check_own(path / name, "directory", stat.S_ISDIR)
-    for name in (
-        "config.json",
-        "manifest.json",
-        "metrics.jsonl",
-        "evaluations.jsonl",
-        "sinks.json",
-    ):
-        _check_own(path / name, "file", stat.S_ISREG)
-    with contextlib.suppress(OSError):  # what cannot be read is missed below
-        for file in path.glob("checkpoints/steps_*.msgpack"):
-            _check_own(file, "file", stat.S_ISREG)
-    return read_config_file(path / "config.json")
+        must = f"must be a run directory or a policy file ({reason.strerror})"
+        raise ConfigError(f"{path}: {must}") from reason
 
 
 def _check_own(part: Path, kind: str, is_kind: Callable[[int], bool]) -> None:
     with contextlib.suppress(OSError):  # what is missing is missed by those who need it
         if not is_kind(part.lstat().st_mode):
-            raise ConfigError(
-                f"{part}: must be a {kind} in the run directory itself, not a link or anything else"
-            )
+            raise ConfigError(f"{part}: must be a {kind} in the run directory, not a link")
 
 
 def read_config_file(path: Path) -> ResolvedConfig:
-    """A configuration as JSON; raises ConfigError if it cannot be read or is invalid."""
+    """Return the configuration in a file of JSON.
+
+    Raises:
+        ConfigError: it cannot be read or is invalid.
+    """
     try:
         data = path.read_bytes()
     except (OSError, ValueError) as reason:
-        raise ConfigError(
-            f"{path}: must be a configuration that can be read ({getattr(reason, 'strerror', reason)})"
-        ) from reason
+        why = getattr(reason, "strerror", reason)
+        raise ConfigError(f"{path}: must be a configuration that can be read ({why})") from reason
     try:
         return resolve(from_dict(json.loads(data)))
     except (ValueError, RecursionError) as reason:
@@ -237,53 +180,30 @@ def read_config_file(path: Path) -> ResolvedConfig:
 
 
 def write_config(path: Path, config: ResolvedConfig) -> None:
-    """`config.json` of the run directory `path`."""
+    """Write `config.json` of the run directory `path`."""
     files.write_json(path / "config.json", to_dict(config))
 
 
-_VERSIONS_OF = (
-    "dgae_jax",
-    "jax",
-    "jaxlib",
-    "flax",
-    "optax",
-    "brax",
-    "mujoco",
-    "mujoco-mjx",
-    "playground",
-    "gymnasium",
-    "numpy",
-)
-
-
-def write_manifest(run_dir: Path, options: RunOptions) -> None:
-    """The first part of a run."""
-    files.write_json(run_dir / "manifest.json", {**_part(options), "resumed": []})
-
-
 def extend_manifest(run_dir: Path, options: RunOptions) -> None:
-    """A part that continues it."""
-    before = _read_manifest(run_dir)
+    """Add the part that resumes a run to `manifest.json`."""
+    before = files.read_object(run_dir / "manifest.json")
     parts = [*_resumed(before), _part(options)]
     files.write_json(run_dir / "manifest.json", {**before, "resumed": parts})
 
 
 def saved_options(run_dir: Path) -> RunOptions:
-    """The options of the last part of the run, as far as they can be read."""
-    return read_options(last_part(run_dir).get("options"))
+    """Return the options of the last part of the run, as far as they can be read."""
+    return options.read_options(last_part(run_dir).get("options"))
 
 
 def environment_changes(run_dir: Path, options: RunOptions) -> list[str]:
-    """What decides the bits of a result and is not what it was in the last part of the run."""
-    was, now = _deciding(last_part(run_dir)), _deciding(_part(options))
-    return [
-        f"{name} {value} (was {was.get(name)})"
-        for name, value in now.items()
-        if was.get(name) != value
-    ]
+    """Return what the bits of a result depend on and is not what it was, with both values."""
+    was, now = _environment(last_part(run_dir)), _environment(_part(options))
+    changed = ((name, value) for name, value in now.items() if was.get(name) != value)
+    return [f"{name} {value} (was {was.get(name)})" for name, value in changed]
 
 
-def _deciding(part: dict[str, Any]) -> dict[str, Any]:
+def _environment(part: dict[str, Any]) -> dict[str, Any]:
     found = {name: part.get(name) for name in ("device", "cores", "processes", "git_revision")}
     for table in (part.get("settings"), part.get("versions")):
         found |= table if isinstance(table, dict) else {}
@@ -292,19 +212,10 @@ def _deciding(part: dict[str, Any]) -> dict[str, Any]:
 
 
 def last_part(run_dir: Path) -> dict[str, Any]:
-    """By what the last part of the run was computed; empty if it cannot be read."""
-    before = _read_manifest(run_dir)
+    """Return the last part of the manifest; empty if it cannot be read."""
+    before = files.read_object(run_dir / "manifest.json")
     part = (_resumed(before) or [before])[-1]
     return part if isinstance(part, dict) else {}
-
-
-def _read_manifest(run_dir: Path) -> dict[str, Any]:
-    """The manifest; empty if there is none that can be understood."""
-    try:
-        found = json.loads((run_dir / "manifest.json").read_text())
-    except (OSError, ValueError, RecursionError):
-        return {}
-    return found if isinstance(found, dict) else {}
 
 
 def _resumed(manifest: dict[str, Any]) -> list[Any]:
@@ -312,8 +223,8 @@ def _resumed(manifest: dict[str, Any]) -> list[Any]:
     return found if isinstance(found, list) else []
 
 
-def _part(options: RunOptions) -> dict[str, Any]:
-    from dgae_jax.run import runtime
+def _part(chosen: RunOptions) -> dict[str, Any]:
+    from dgae_jax.run import runtime  # JAX is loaded when a run begins
 
     return {
         "started": time.strftime("%Y-%m-%dT%H:%M:%S%z"),
@@ -322,8 +233,8 @@ def _part(options: RunOptions) -> dict[str, Any]:
         "python": platform.python_version(),
         "platform": platform.platform(),
         **runtime.hardware(),
-        "versions": {name: _version(name) for name in _VERSIONS_OF},
-        "options": options_to_save(options),
+        "versions": {name: _version(name) for name in VERSIONED},
+        "options": options.saved_options(chosen),
     }
 
 
@@ -337,28 +248,16 @@ def _version(name: str) -> str | None:
 
 @cache
 def _git_revision() -> str | None:
-    """The commit of the source tree, `+` appended where files differ from it; None outside a checkout.
-
-    A busy machine takes its time to say so, and None of a checkout would keep a run from going on.
-    """
+    """Return the commit, `+` appended where files differ from it; None outside a checkout."""
 
     def git(*words: str) -> str:
-        done = subprocess.run(
-            ["git", *words],
-            cwd=Path(__file__).parent,
-            capture_output=True,
-            text=True,
-            check=True,
-            timeout=60,
-        )
-        return done.stdout.strip()
+        how: dict[str, Any] = {"cwd": Path(__file__).parent, "capture_output": True, "text": True}
+        # a busy machine takes its time, and None in a checkout would refuse a resume
+        return subprocess.run(["git", *words], check=True, timeout=60, **how).stdout.strip()
 
     try:
-        git(
-            "ls-files", "--error-unmatch", Path(__file__).name
-        )  # a repository around an installed package is another one
-        return git("rev-parse", "HEAD") + (
-            "+" if git("status", "--porcelain", "--untracked-files=no") else ""
-        )
+        git("ls-files", "--error-unmatch", Path(__file__).name)  # not a repository around it
+        differs = git("status", "--porcelain", "--untracked-files=no")
+        return git("rev-parse", "HEAD") + ("+" if differs else "")
     except (OSError, subprocess.SubprocessError):
         return None

@@ -1,4 +1,4 @@
-"""Files that are whole or not there, and files that grow line by line."""
+"""Files that are written atomically, and files of JSON lines that grow."""
 
 import contextlib
 import errno
@@ -12,9 +12,9 @@ from typing import Any
 
 
 def replace(path: Path, data: bytes) -> None:
-    """`data` as the file `path`, complete or not at all: a crash at any byte leaves what was there. No link is followed."""
+    """Write a file atomically: a crash at any byte leaves the old content. No link is followed."""
     part = path.with_name(path.name + ".part")
-    with _named(path):
+    with _naming(path):
         part.unlink(missing_ok=True)  # of a crash, or a link that was laid there
         try:
             with part.open("xb") as file:
@@ -29,7 +29,7 @@ def replace(path: Path, data: bytes) -> None:
 
 @contextlib.contextmanager
 def turn(directory: Path) -> Iterator[None]:
-    """Of several processes that write the same files in a directory one after the other; all at once where there are no locks."""
+    """Let one process at a time write the files in a directory, where there are locks."""
     descriptor = os.open(directory, os.O_RDONLY)
     try:
         with contextlib.suppress(OSError):  # some network file systems have none
@@ -40,12 +40,12 @@ def turn(directory: Path) -> Iterator[None]:
 
 
 def beside(source: Path, name: str) -> Path:
-    """Where what was made of a run is written: in its directory, or beside the file of a policy, with its name in front."""
+    """Return where to write what is made of a run directory, or of a policy file."""
     return source.with_name(f"{source.stem}-{name}") if source.is_file() else source / name
 
 
 def sync_directory(path: Path) -> None:
-    """The names in a directory are on the disk when this returns; a rename alone may be lost with the power."""
+    """Flush the names in a directory to the disk, without which a rename may be lost."""
     descriptor = os.open(path, os.O_RDONLY)
     try:
         os.fsync(descriptor)
@@ -57,21 +57,25 @@ def sync_directory(path: Path) -> None:
 
 
 def write_json(path: Path, data: Any) -> None:
-    """Indented JSON, complete or not at all; numbers that are not finite are null."""
-    replace(path, (_json(data, indent=2) + "\n").encode())
+    """Write indented JSON atomically; numbers that are not finite become null."""
+    replace(path, (json.dumps(_finite(data), indent=2, allow_nan=False) + "\n").encode())
+
+
+def read_object(path: Path) -> dict[str, Any]:
+    """Return the JSON object in a file, empty if there is none that can be read."""
+    try:
+        found = json.loads(path.read_bytes())
+    except (OSError, ValueError, RecursionError):
+        return {}
+    return found if isinstance(found, dict) else {}
 
 
 def json_lines(rows: Iterable[dict[str, Any]]) -> bytes:
-    """One line of JSON per row; numbers that are not finite are null."""
-    return "".join(_json(row) + "\n" for row in rows).encode()
-
-
-def _json(data: Any, indent: int | None = None) -> str:
-    return json.dumps(_finite(data), indent=indent, allow_nan=False)
+    """Return one line of JSON per row; numbers that are not finite become null."""
+    return "".join(json.dumps(_finite(row), allow_nan=False) + "\n" for row in rows).encode()
 
 
 def _finite(data: Any) -> Any:
-    """JSON has no word for NaN and infinity."""
     if isinstance(data, dict):
         return {name: _finite(value) for name, value in data.items()}
     if isinstance(data, list | tuple):
@@ -80,15 +84,15 @@ def _finite(data: Any) -> Any:
 
 
 def append_rows(path: Path, rows: Iterable[dict[str, Any]]) -> None:
-    """Add rows to a file of JSON lines; they are on the disk, ahead of whatever is written next, when this returns."""
-    with _named(path), path.open("ab") as file:
+    """Append rows to a file of JSON lines and flush them to the disk."""
+    with _naming(path), path.open("ab") as file:
         file.write(json_lines(rows))
         file.flush()
         os.fsync(file.fileno())
 
 
 def whole_rows(path: Path) -> Iterator[tuple[dict[str, Any], int]]:
-    """Each row of a file of JSON lines and the offset behind it, up to the first line that is torn or not a row."""
+    """Yield each row of a file of JSON lines and its end offset, up to the first damaged line."""
     end = 0
     with path.open("rb") as file:
         for line in file:
@@ -103,8 +107,8 @@ def whole_rows(path: Path) -> Iterator[tuple[dict[str, Any], int]]:
 
 
 @contextlib.contextmanager
-def _named(path: Path) -> Iterator[None]:
-    """Errors of the operating system say which file they are about, also when a write or a close fails."""
+def _naming(path: Path) -> Iterator[None]:
+    """Name the file in an OSError, also when a write or a close fails."""
     try:
         yield
     except OSError as reason:

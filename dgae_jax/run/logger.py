@@ -1,4 +1,4 @@
-"""What a run leaves in its directory while it trains: metrics, checkpoints, evaluations, a curve."""
+"""What a run writes while it trains: metrics, checkpoints, evaluations and the learning curve."""
 
 import gc
 import time
@@ -11,12 +11,11 @@ import jax
 import numpy as np
 
 from dgae_jax.configs.resolved import ResolvedConfig
-from dgae_jax.learn.build import InferenceState
-from dgae_jax.learn.types import TrainState
+from dgae_jax.learn.types import InferenceState, TrainState
 from dgae_jax.physics.engine import PhysicsState
 from dgae_jax.run import checkpoint, metrics, runtime, terminal
 from dgae_jax.run.evaluation import evaluate_policies
-from dgae_jax.run.loggers import Feed
+from dgae_jax.run.loggers import LoggerFeed
 from dgae_jax.run.metrics import EvaluationsFile, MetricsFile
 from dgae_jax.run.options import RunOptions
 from dgae_jax.run.runtime import Stopped, Watch
@@ -26,36 +25,37 @@ if TYPE_CHECKING:
 
 
 class RunLogger:
-    """The growing files of one run directory, begun anew or continued behind the iterations `done`.
+    """The growing files of one run directory.
 
-    Checkpoints and plots are written beside the training, one after the other; a failure is raised by the call after.
+    Checkpoints and plots are written in a thread; a failure is raised by the next call.
     """
 
     def __init__(self, run_dir: Path, config: ResolvedConfig, options: RunOptions, done: int):
+        """Open the files, new or continued behind `done` iterations."""
         self.run_dir, self.config, self.options = run_dir, config, options
         (run_dir / "checkpoints").mkdir(exist_ok=True)
         self.metrics = MetricsFile(run_dir / "metrics.jsonl", config, done)
         self.evaluations = EvaluationsFile(run_dir / "evaluations.jsonl")
         self.evaluations.cut(done * config.samples_per_iteration, config.num_seeds)
-        self.feed = Feed(options.log if runtime.is_first() else (), run_dir, config, self.steps)
+        names = options.log if runtime.is_first() else ()
+        self.feed = LoggerFeed(names, run_dir, config, self.steps)
         self.page = terminal.Page(self.figure) if terminal.in_notebook() else None
-        """Where the learning curve is shown as it grows."""
         self.began = time.monotonic() - self.metrics.seconds
-        self.beside, self.pending = ThreadPoolExecutor(1), Future()
+        self.thread, self.pending = ThreadPoolExecutor(1), Future()
         self.pending.set_result(None)
 
     def __enter__(self) -> "RunLogger":
         return self
 
     def __exit__(self, kind: Any, *_) -> None:
-        self.beside.shutdown()
+        self.thread.shutdown()
         self.feed.close(finished=kind is None)
         if kind is None or issubclass(kind, Stopped):
             self.pending.result()
 
-    def _write(self, file: Callable, *args) -> None:
+    def _write(self, work: Callable, *args) -> None:
         self.pending.result()
-        self.pending = self.beside.submit(file, *args)
+        self.pending = self.thread.submit(work, *args)
 
     @property
     def steps(self) -> int:
@@ -68,52 +68,39 @@ class RunLogger:
         return self.evaluations.has(self.steps)
 
     def append(self, state: TrainState, measured: dict[str, Any], count: int) -> float | None:
-        """Add `count` iterations to the metrics; the mean return of the last one, if there is any yet."""
+        """Add `count` iterations to the metrics and return the last mean return, if any."""
         rows = self.metrics.append(measured, count, time.monotonic() - self.began)
         self.feed.rows(rows)
         if self.options.debug_nonfinite:
-            self._save_incidents(state, {row["seed"] for row in rows if row["nonfinite"]})
-        returns = [
-            row["episode_return"]
-            for row in rows[-self.config.num_seeds :]
-            if row["episode_return"] is not None
-        ]
+            for seed in sorted({row["seed"] for row in rows if row["nonfinite"]}):
+                self._save_incidents(state, seed)
+        last = [row["episode_return"] for row in rows[-self.config.num_seeds :]]
+        returns = [x for x in last if x is not None]
         return float(np.mean(returns)) if returns else None
 
     def save(self, state: TrainState) -> None:
-        """Write a checkpoint, from a copy: the state itself may be consumed meanwhile."""
+        """Write a checkpoint from a copy: the state itself may be donated meanwhile."""
         keep = self.options.keep_checkpoints, self.evaluations.best
-        self._write(
-            checkpoint.save,
-            self.run_dir / "checkpoints",
-            self.config,
-            checkpoint.arrays_of(state),
-            self.steps,
-            *keep,
-        )
+        directory, arrays = self.run_dir / "checkpoints", checkpoint.arrays_of(state)
+        self._write(checkpoint.save, directory, self.config, arrays, self.steps, *keep)
 
     def evaluate(self, policies: InferenceState, watch: Watch) -> dict[str, Any]:
-        """Returns of the policies as they are now, noted and drawn."""
-        result = evaluate_policies(
-            policies,
-            self.config,
-            engine=self.options.eval_engine,
-            episodes=self.options.episodes,
-            watch=watch,
-        )
+        """Evaluate the policies and write and draw the result."""
+        how = {"engine": self.options.eval_engine, "episodes": self.options.episodes}
+        result = evaluate_policies(policies, self.config, **how, watch=watch)
         if not self.evaluated:
-            self.pending.result()  # no evaluation is on the disk without its checkpoint, from which the run goes on
+            self.pending.result()  # the checkpoint is on the disk before its evaluation
             self.evaluations.append(self.steps, result)
             self.feed.evaluations([{"steps": self.steps, **one} for one in result["seeds"]])
         self.draw()
         return result
 
     def draw(self) -> None:
-        """The learning curve so far."""
+        """Write the learning curve so far."""
         self._write(_plot, self.run_dir / "curve.png", *self._curve())
 
     def figure(self) -> "Figure | None":
-        """The learning curve so far, None before the first return."""
+        """Return the learning curve so far, None before the first return."""
         data = self._curve()
         return None if np.isnan(data[1]).all() else metrics.learning_curve(*data)
 
@@ -121,32 +108,20 @@ class RunLogger:
         title = f"{self.config.task}, {self.config.algo}, {self.config.physics}"
         return *self.metrics.curve(), title, self.evaluations.points()
 
-    def _save_incidents(self, state: TrainState, seeds: set[int]) -> None:
-        """Of every world that has turned non-finite the last state and action from which it did, per run: arrays by name."""
-        for seed in sorted(seeds):
-            episodes = jax.tree.map(
-                lambda x, i=seed - self.config.seed: x[i], runtime.gather(state.episodes)
-            )
-            worlds = np.flatnonzero(episodes.nonfinite)
-            world, action = jax.tree.map(lambda x, at=worlds: x[at], episodes.incident)
-            names = (
-                world._fields
-                if isinstance(world, PhysicsState)
-                else range(len(jax.tree.leaves(world)))
-            )
-            arrays = {
-                str(name): leaf for name, leaf in zip(names, jax.tree.leaves(world), strict=True)
-            }
-            directory = self.run_dir / "nonfinite"
-            directory.mkdir(exist_ok=True)
-            np.savez(
-                directory / f"steps_{self.steps:012d}_seed_{seed}.npz",
-                world=worlds,
-                **arrays,
-                action=action,
-            )
+    def _save_incidents(self, state: TrainState, seed: int) -> None:
+        """Write the last state and action from which each env of a seed turned non-finite."""
+        index = seed - self.config.seed
+        episodes = jax.tree.map(lambda x: x[index], runtime.gather(state.episodes))
+        envs = np.flatnonzero(episodes.nonfinite)
+        before, action = jax.tree.map(lambda x: x[envs], episodes.incident)
+        leaves = jax.tree.leaves(before)
+        names = before._fields if isinstance(before, PhysicsState) else range(len(leaves))
+        arrays = {str(name): leaf for name, leaf in zip(names, leaves, strict=True)}
+        path = self.run_dir / "nonfinite" / f"steps_{self.steps:012d}_seed_{seed}.npz"
+        path.parent.mkdir(exist_ok=True)
+        np.savez(path, env=envs, **arrays, action=action)
 
 
 def _plot(path: Path, *data) -> None:
     metrics.save_figure(metrics.learning_curve(*data), path)
-    gc.collect()  # a figure is full of cycles, and left alone figures gather: 3 MB each
+    gc.collect()  # a figure is full of cycles: 3 MB each

@@ -1,17 +1,17 @@
-"""What a user may choose about a run beside its configuration."""
+"""Options of a run beside its configuration: where it is written, evaluated and shared."""
 
 import importlib.util
 import re
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypedDict
 
 from dgae_jax.configs.config import ConfigError, invalid
 from dgae_jax.configs.resolved import ResolvedConfig
 from dgae_jax.envs.registry import spec_of
 
 METRIC_LOGGERS = {"tensorboard": "tensorboardX", "wandb": "wandb", "mlflow": "mlflow"}
-"""Viewers of metrics that a run can feed, and the library that each takes."""
+"""Metric loggers, and the library that each needs."""
 
 
 @dataclass(frozen=True)
@@ -21,41 +21,61 @@ class RunOptions:
     run_dir: Path | None = None
     """Directory to write, new or empty; by default runs/ENV-ALGO-SEED-TIME [path]."""
     cache_dir: str = "~/.cache/dgae_jax"
-    """Where compiled programs are kept between runs; none disables [path]."""
+    """Directory of compiled programs, kept between runs; none disables [path]."""
     checkpoint_every: int = 200_000
-    """Samples of each run between checkpoints, which are evaluated too; one is always saved at the end [environment steps]."""
+    """Samples of each run between checkpoints, which are evaluated too [environment steps]."""
     keep_checkpoints: int = 3
-    """The latest checkpoints that are kept, beside the one with the best evaluation [files]."""
+    """Latest checkpoints to keep, beside the one with the best evaluation [files]."""
     devices: int | None = None
-    """Devices of each process that share the run, which divide its worlds or its seeds; by default all, and of a CPU's cores as
-    many as have 16 worlds each [devices]."""
+    """Devices of each process, which divide the envs or the seeds; by default all, and of a CPU's
+    cores as many as have 16 envs each [devices]."""
     coordinator: str | None = None
-    """Where the processes of a run on several hosts meet, HOST:PORT of the first; Slurm, Open MPI, Kubernetes and TPU pods say it
-    themselves [address]."""
+    """Address of the first of several processes, HOST:PORT; detected under Slurm, Open MPI,
+    Kubernetes and on TPU pods [address]."""
     num_processes: int | None = None
-    """Processes that share the run; 1 to train alone where a scheduler started several [processes]."""
+    """Processes that share the run; 1 to train alone under a scheduler [processes]."""
     process_id: int | None = None
-    """Which of them this is, from 0; the first one writes."""
+    """Number of this process, from 0; the first one writes."""
     resume: Path | None = None
-    """Continue the run in this directory, bit for bit, with its flags where none are given [path]."""
+    """Continue the run in this directory, bit for bit, with its flags unless given [path]."""
     resume_or_start: bool = False
-    """Continue the run in --run-dir if there is one, otherwise start it there: one command for schedulers that requeue."""
+    """Continue the run in --run-dir if there is one, otherwise start it there."""
     inexact: bool = False
-    """Let --resume continue with another --physics, device, number of cores or versions: the same in the statistical sense only."""
+    """Let --resume continue with other physics, devices, cores or versions: not bit-identical."""
     max_nonfinite: int = 10
-    """Failures in a row before the run is stopped: an update not finite and left out, or most world steps invalid [iterations]."""
+    """Failed iterations in a row (a skipped update, or most env steps masked) before the run
+    stops [iterations]."""
     eval_engine: str | None = None
-    """Where policies are evaluated: gymnasium, whose task has no noise, or an engine as in --physics, with the noise of the
+    """Engine of evaluations: gymnasium, without noise, or one of --physics, with the noise of
     training; by default the first that the task has."""
     episodes: int = 20
     """Episodes of every evaluation, per run [episodes]."""
     debug_nonfinite: bool = False
-    """Write the states and actions from which worlds turn non-finite to nonfinite/ in the run directory, for replay."""
+    """Write the states and actions from which envs turn non-finite to RUN_DIR/nonfinite/."""
     log: tuple[str, ...] = ()
-    """Viewers that get the metrics too: tensorboard, wandb, mlflow; several may be named, --log alone means none."""
+    """Metric loggers: tensorboard, wandb, mlflow; --log alone means none."""
 
     def __post_init__(self):
         object.__setattr__(self, "log", tuple(self.log))  # a list, from Python or JSON
+
+
+class TrainOptions(TypedDict, total=False):
+    """Keyword options of `dgae_jax.train`: fields of `RunOptions`."""
+
+    cache_dir: str
+    checkpoint_every: int
+    keep_checkpoints: int
+    devices: int | None
+    coordinator: str | None
+    num_processes: int | None
+    process_id: int | None
+    resume_or_start: bool
+    inexact: bool
+    max_nonfinite: int
+    eval_engine: str | None
+    episodes: int
+    debug_nonfinite: bool
+    log: tuple[str, ...]
 
 
 INTEGER_RANGES = {
@@ -67,17 +87,65 @@ INTEGER_RANGES = {
     "max_nonfinite": (1, 2**31 - 1, "iterations are counted in an int32"),
     "episodes": (1, 10_000, "they are played side by side"),
 }
-"""Whole numbers: from, to, and why not more."""
+"""Smallest and largest value of each whole number, and why not more."""
+
+
+def engines_of(config: ResolvedConfig) -> tuple[str, ...]:
+    """Return the engines that can evaluate a run, the default first."""
+    spec = spec_of(config.env)
+    return ("gymnasium", *spec.engines) if spec.referees else spec.engines
+
+
+def engine_of(config: ResolvedConfig, engine: str | None, setting: str = "engine") -> str:
+    """Return the engine of that name, or the default.
+
+    Raises:
+        ConfigError: the run cannot be evaluated there; `setting` names the flag.
+    """
+    engines = engines_of(config)
+    if engine is not None and engine not in engines:
+        raise invalid(setting, engine, f"one of {', '.join(engines)} with {config.env}")
+    return engine or engines[0]
+
+
+def eval_env_id(config: ResolvedConfig) -> str:
+    """Return Gymnasium's id of the evaluation env, or our name where Gymnasium lacks the task."""
+    return spec_of(config.env).referee(config.env_version) or config.env
 
 
 def validate_options(options: RunOptions, config: ResolvedConfig) -> None:
-    """Raise `ConfigError` for the first option that is invalid, in a run of `config`."""
+    """Raise ConfigError for the first option that is invalid in a run of `config`."""
     engine_of(config, options.eval_engine, "eval_engine")
     for name, (low, high, reason) in INTEGER_RANGES.items():
         value = getattr(options, name)
         if value is not None and not (type(value) is int and low <= value <= high):
             raise invalid(name, value, f"a whole number from {low:,} to {high:,} ({reason})")
-    _validate_log(options.log)
+    for name in options.log:
+        _validate_logger(name, options.log)
+    _validate_processes(options)
+    if options.resume is not None and options.run_dir is not None:
+        raise invalid("run_dir", options.run_dir, f"left out: --resume writes to {options.resume}")
+    if options.resume is not None and options.resume_or_start:
+        raise invalid("resume_or_start", True, "left out: --resume only resumes")
+    if options.resume_or_start and options.run_dir is None:
+        raise invalid("resume_or_start", True, "used with --run-dir DIR")
+    if options.inexact and options.resume is None and not options.resume_or_start:
+        raise invalid("inexact", True, "left out without --resume")
+
+
+def _validate_logger(name: str, names: tuple[str, ...]) -> None:
+    if name not in METRIC_LOGGERS:
+        raise invalid("log", name, f"one or more of {', '.join(METRIC_LOGGERS)}")
+    if names.count(name) > 1:
+        raise invalid("log", names, "each logger once")
+    package = METRIC_LOGGERS[name]
+    spec = importlib.util.find_spec(package)
+    if spec is None or spec.origin is None:  # a folder of that name, such as wandb leaves
+        install = f'pip install "dgae_jax[{name}]"'
+        raise ConfigError(f"log {name}: {package} is missing; {install}", "log")
+
+
+def _validate_processes(options: RunOptions) -> None:
     if options.coordinator is not None:
         if not re.fullmatch(r"[^\s:]+:\d{1,5}", options.coordinator):
             raise invalid("coordinator", options.coordinator, "HOST:PORT")
@@ -88,36 +156,11 @@ def validate_options(options: RunOptions, config: ResolvedConfig) -> None:
         name = "num_processes" if options.process_id is None else "process_id"
         raise invalid(name, getattr(options, name), "left out without --coordinator")
     if options.process_id is not None and options.process_id >= (options.num_processes or 0):
-        raise invalid(
-            "process_id", options.process_id, f"below --num-processes {options.num_processes}"
-        )
-    if options.resume is not None and options.run_dir is not None:
-        raise invalid("run_dir", options.run_dir, f"left out: --resume writes to {options.resume}")
-    if options.resume is not None and options.resume_or_start:
-        raise invalid("resume_or_start", True, "left out: --resume only resumes")
-    if options.resume_or_start and options.run_dir is None:
-        raise invalid("resume_or_start", True, "used with the directory to look in, --run-dir DIR")
-    if options.inexact and options.resume is None and not options.resume_or_start:
-        raise invalid("inexact", True, "left out without --resume")
+        limit = f"below --num-processes {options.num_processes}"
+        raise invalid("process_id", options.process_id, limit)
 
 
-def _validate_log(names: tuple[str, ...]) -> None:
-    for name in names:
-        if name not in METRIC_LOGGERS:
-            raise invalid("log", name, f"one or more of {', '.join(METRIC_LOGGERS)}")
-        if names.count(name) > 1:
-            raise invalid("log", names, "each viewer once")
-        spec = importlib.util.find_spec(METRIC_LOGGERS[name])
-        if (
-            spec is None or spec.origin is None
-        ):  # a folder of that name in the working directory, such as Weights & Biases leaves
-            raise ConfigError(
-                f'log {name}: {METRIC_LOGGERS[name]} is missing; pip install "dgae_jax[{name}]"',
-                "log",
-            )
-
-
-_KEPT = (
+_SAVED = (
     "devices",
     "checkpoint_every",
     "keep_checkpoints",
@@ -127,43 +170,17 @@ _KEPT = (
     "debug_nonfinite",
     "log",
 )
-"""What a run goes on with when it is resumed."""
 
 
 def saved_options(options: RunOptions) -> dict[str, Any]:
-    """What a run goes on with, for JSON."""
-    return {name: getattr(options, name) for name in _KEPT} | {"log": list(options.log)}
+    """Return the options that a resumed run keeps, as plain data for JSON."""
+    return {name: getattr(options, name) for name in _SAVED} | {"log": list(options.log)}
 
 
 def read_options(data: Any) -> RunOptions:
-    """What `saved_options` wrote; defaults for all else."""
+    """Return the options that `saved_options` wrote; values of other types are left out."""
     found = data if isinstance(data, dict) else {}
     usual = saved_options(RunOptions(devices=1, eval_engine=""))
-    kept: dict[str, Any] = {
-        name: found[name] for name in _KEPT if type(found.get(name)) is type(usual[name])
-    }
-    viewers: dict[str, Any] = {
-        "log": [name for name in METRIC_LOGGERS if name in kept.get("log", [])]
-    }
-    return RunOptions(**kept | viewers)
-
-
-def engines_of(config: ResolvedConfig) -> tuple[str, ...]:
-    """Where a run can be evaluated, the referee first: Gymnasium for our tasks and its own, the run's own physics for any other."""
-    spec = spec_of(config.env)
-    return ("gymnasium", *spec.engines) if spec.referees else spec.engines
-
-
-def engine_of(config: ResolvedConfig, engine: str | None, setting: str = "engine") -> str:
-    """The engine of that name, the first of `engines_of` where there is none; raises ConfigError if the run cannot have it.
-
-    `setting` is what the name was given as.
-    """
-    if engine is not None and engine not in engines_of(config):
-        raise invalid(setting, engine, f"one of {', '.join(engines_of(config))} with {config.env}")
-    return engine or engines_of(config)[0]
-
-
-def eval_env_id(config: ResolvedConfig) -> str:
-    """Gymnasium's name of the task, or ours where Gymnasium does not play it."""
-    return spec_of(config.env).referee(config.env_version) or config.env
+    kept = {name: found[name] for name in _SAVED if type(found.get(name)) is type(usual[name])}
+    log = tuple(name for name in METRIC_LOGGERS if name in kept.get("log", []))
+    return RunOptions(**{**kept, "log": log})

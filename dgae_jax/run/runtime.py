@@ -1,4 +1,8 @@
-"""Compiling, which may take minutes inside XLA, while this process still listens."""
+"""The machine under a run: devices, processes, signals and the compiler.
+
+Several processes, on one host or many, may share a run: all compute, the first one writes. What
+decides the course of a run, clock and signals, is agreed on, so that all make the same calls.
+"""
 
 import contextlib
 import os
@@ -27,40 +31,54 @@ from dgae_jax.run import terminal
 from dgae_jax.run.options import RunOptions
 
 Watch = Callable[[str], None]
-"""Told, now and then, what is going on; what it raises breaks it off."""
+"""Called now and then with a line of progress; what it raises breaks the work off."""
 
-LOOK_EVERY = 0.5
-"""Seconds between looks at the compiler."""
+POLL_SECONDS = 0.5
+"""Time between looks at the compiler."""
 
 COMPILER_THREAD = "dgae_jax compiler"
 
+SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+"""Ctrl-C, a scheduler, and a terminal that was closed."""
+
+ENVS_PER_CORE = 16
+"""Fewer are stepped no faster: at that number every operation takes as long as its start."""
+
+JAX_SETTINGS = (
+    "jax_enable_x64",
+    "jax_default_prng_impl",
+    "jax_threefry_partitionable",
+    "jax_default_matmul_precision",
+)
+"""Settings that the environment may change and on which the bits of a run depend."""
+
 
 def unwatched(_: str) -> None:
-    """Tell nobody."""
+    """Ignore progress."""
 
 
 def compile_in_thread(
     program: Any, *args: Any, watch: Watch = unwatched, what: str = "compiling"
 ) -> None:
-    """Compile a jitted function for such arguments, so that calling it does not; in a thread, while this one waits.
+    """Compile a jitted function for these arguments, in a thread, while this one stays responsive.
 
-    Python runs no signal handler as long as its main thread is inside of XLA. An exception that `watch` raises leaves the
-    compiler to itself: it cannot be broken off, and holds up or aborts the end of the process unless that is `os._exit`.
+    Python runs no signal handler while its main thread is inside XLA. A compiler that `watch`
+    breaks off keeps running, and aborts the end of the process unless that is `os._exit`.
     """
     since, done = time.monotonic(), Future()
     watch(what)
-    lowered = program.lower(*args)  # here, where settings of this thread hold
+    lowered = program.lower(*args)  # in this thread, whose JAX settings hold
 
-    def work():
+    def compile_lowered():
         try:
             done.set_result(lowered.compile())
         except BaseException as reason:
             done.set_exception(reason)
 
-    threading.Thread(target=work, daemon=True, name=COMPILER_THREAD).start()
+    threading.Thread(target=compile_lowered, daemon=True, name=COMPILER_THREAD).start()
     while True:
         try:
-            done.result(LOOK_EVERY)
+            done.result(POLL_SECONDS)
             return
         except TimeoutError:
             if done.done():
@@ -69,62 +87,58 @@ def compile_in_thread(
 
 
 def is_compiling() -> bool:
-    """Whether a compiler was left to itself and has not finished."""
-    return any(
-        thread.name == COMPILER_THREAD and thread.is_alive() for thread in threading.enumerate()
-    )
+    """Return whether a compiler that was broken off still runs."""
+    return any(t.name == COMPILER_THREAD and t.is_alive() for t in threading.enumerate())
 
 
 def join_processes(options: RunOptions) -> None:
-    """Meet the other processes of the run, if there are any; raises ConfigError if they do not come."""
-    if (
-        jax.distributed.is_initialized()
-        or options.num_processes == 1
-        or not (options.coordinator or _detected())
-    ):
+    """Meet the other processes of the run, if there are any.
+
+    Raises:
+        ConfigError: they do not come.
+    """
+    several = options.coordinator or _under_scheduler()
+    if jax.distributed.is_initialized() or options.num_processes == 1 or not several:
         return
     try:
         jax.distributed.initialize(options.coordinator, options.num_processes, options.process_id)
     except (RuntimeError, ValueError) as reason:
         where = options.coordinator or "found by JAX"
         why = str(reason).partition("\n")[0][:300]
-        raise ConfigError(
-            f"coordinator {where}: must be where all processes of the run meet ({why})",
-            "coordinator",
-        ) from reason
+        message = f"coordinator {where}: must be where all processes of the run meet ({why})"
+        raise ConfigError(message, "coordinator") from reason
 
 
-def _detected() -> bool:
-    """Whether a scheduler started several processes of this program: Slurm, Open MPI, Kubernetes (an indexed job) or a TPU pod."""
-    several = any(
-        int(os.environ.get(name) or 1) > 1 for name in ("SLURM_NTASKS", "OMPI_COMM_WORLD_SIZE")
-    )
+def _under_scheduler() -> bool:
+    """Return whether Slurm, Open MPI, Kubernetes or a TPU pod started several processes."""
+    sizes = (os.environ.get(name) or 1 for name in ("SLURM_NTASKS", "OMPI_COMM_WORLD_SIZE"))
     pod = "," in os.environ.get("TPU_WORKER_HOSTNAMES", "")
-    return several or pod or {"KUBERNETES_SERVICE_HOST", "JOB_COMPLETION_INDEX"} <= set(os.environ)
+    job = {"KUBERNETES_SERVICE_HOST", "JOB_COMPLETION_INDEX"} <= set(os.environ)
+    return any(int(size) > 1 for size in sizes) or pod or job
 
 
 def is_alone() -> bool:
-    """Whether no other process shares the run."""
+    """Return whether no other process shares the run."""
     return jax.process_count() == 1
 
 
 def is_first() -> bool:
-    """Whether this is the process that writes."""
+    """Return whether this is the process that writes."""
     return jax.process_index() == 0
 
 
 def of_first(value: int) -> int:
-    """The first process's value; every process must ask."""
+    """Return the first process's value; every process must call."""
     return value if is_alone() else int(multihost_utils.broadcast_one_to_all(np.int32(value)))
 
 
 def largest(value: int) -> int:
-    """The largest value of any process; every process must ask."""
+    """Return the largest value of any process; every process must call."""
     return value if is_alone() else int(multihost_utils.process_allgather(np.int32(value)).max())
 
 
 def gather(tree: Any) -> Any:
-    """The arrays of a tree on this host, where devices of other processes may hold parts of them; every process must ask."""
+    """Return a tree's arrays on this host, also parts on other hosts; every process must call."""
 
     def one(x: Any) -> np.ndarray:
         if isinstance(x, jax.Array) and not (x.is_fully_addressable or x.is_fully_replicated):
@@ -136,37 +150,34 @@ def gather(tree: Any) -> Any:
 
 @contextlib.contextmanager
 def writing_directory(run_dir: Path) -> Iterator[Path]:
-    """The directory that this process writes: the run's own, or for all but the first a copy of what there is, which goes at the end."""
+    """Yield the directory that this process writes: all but the first write a temporary copy."""
     if is_first():
-        _meet()
+        _barrier()
         yield run_dir
         return
     with tempfile.TemporaryDirectory(prefix="dgae_jax-") as scratch, terminal.silenced():
-        mine = Path(scratch) / "run"
+        copy = Path(scratch) / "run"
         if run_dir.exists():
-            shutil.copytree(run_dir, mine)
-        _meet()
-        yield mine
+            shutil.copytree(run_dir, copy)
+        _barrier()
+        yield copy
 
 
-def _meet() -> None:
+def _barrier() -> None:
     if not is_alone():
         multihost_utils.sync_global_devices("dgae_jax")
 
 
-SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
-"""Ctrl-C, a scheduler, and a terminal that was closed."""
-
-
 class Stopped(Exception):
-    """A signal arrived where nothing is lost by stopping at once."""
+    """A signal arrived while nothing is lost by stopping at once."""
 
 
 class Signals:
-    """Notes the first signal, so that the running dispatch can finish; a second one ends the process at once.
+    """Record the first stop signal, so that the running dispatch can finish.
 
-    A second SIGHUP does not: a terminal that closes may send several, and systemd sends one after SIGTERM. SIGHUP stays
-    ignored where it was (`nohup`). Outside of the main thread Python has no signals, and none are noted.
+    A second signal ends the process at once, but for SIGHUP: a terminal that closes may send
+    several, and systemd sends one after SIGTERM. SIGHUP stays ignored where it was (`nohup`).
+    Outside the main thread Python has no signals.
     """
 
     def __init__(self):
@@ -177,12 +188,9 @@ class Signals:
 
     def __enter__(self) -> "Signals":
         if threading.current_thread() is threading.main_thread():
-            noted = [
-                kind
-                for kind in SIGNALS
-                if kind != signal.SIGHUP or signal.getsignal(kind) != signal.SIG_IGN
-            ]
-            self.before = {kind: signal.signal(kind, self._note) for kind in noted}
+            ignored = signal.getsignal(signal.SIGHUP) == signal.SIG_IGN
+            kinds = [kind for kind in SIGNALS if not (kind == signal.SIGHUP and ignored)]
+            self.before = {kind: signal.signal(kind, self._record) for kind in kinds}
         return self
 
     def __exit__(self, *_) -> None:
@@ -191,25 +199,25 @@ class Signals:
 
     @contextlib.contextmanager
     def may_stop(self, watch: Watch = unwatched) -> Iterator[Watch]:
-        """Around work that may be broken off: raises `Stopped` if a signal has arrived, as does the watch that it gives, later.
+        """Raise `Stopped` if a signal has arrived; so does the watch that it yields, later.
 
-        The handler itself raises nothing: it may interrupt an import or a destructor of anybody's, which would lose the exception or
-        keep a lock. Of several processes none can be broken off alone: there only what all have agreed on counts.
+        The handler raises nothing: it may interrupt an import or a destructor. Of several
+        processes none can stop alone: there only a signal that all have agreed on counts.
         """
 
-        def heeding(text: str) -> None:
+        def checked(text: str) -> None:
             self._stop()
             watch(text)
 
         self.nothing_to_lose = is_alone() or self.agreed
         try:
             self._stop()
-            yield heeding
+            yield checked
         finally:
             self.nothing_to_lose = False
 
     def anywhere(self) -> bool:
-        """Whether a signal has come to any process of the run; every process must ask."""
+        """Return whether any process of the run got a signal; every process must call."""
         kind = largest(self.received or 0)
         if kind:
             self.received, self.agreed = signal.Signals(kind), True
@@ -217,7 +225,7 @@ class Signals:
 
     @property
     def name(self) -> str:
-        """Of the signal that came: SIGINT, SIGTERM or SIGHUP."""
+        """SIGINT, SIGTERM or SIGHUP."""
         return self.received.name if self.received else ""
 
     @property
@@ -229,116 +237,90 @@ class Signals:
         if self.received and self.nothing_to_lose:
             raise Stopped
 
-    def _note(self, kind: int, _) -> None:
+    def _record(self, kind: int, _) -> None:
         self.received = signal.Signals(kind)
         for each in self.before:
             signal.signal(each, signal.SIG_IGN if each == signal.SIGHUP else signal.SIG_DFL)
         if self.nothing_to_lose:
             return
+        text = "finishing the running dispatch, then saving; a second signal ends the run at once"
         with contextlib.suppress(OSError):  # no print: it may be what was interrupted
-            os.write(
-                2,
-                f"{self.name}: finishing what is running, then saving; a second signal ends it at once\n".encode(),
-            )
-
-
-_SETTINGS = (
-    "jax_enable_x64",
-    "jax_default_prng_impl",
-    "jax_threefry_partitionable",
-    "jax_default_matmul_precision",
-)
-"""Of JAX, which the environment may change and on which the bits depend."""
-
-
-ENVS_PER_CORE = 16
-"""Fewer are stepped no faster: at that number every operation takes as long as its start."""
+            os.write(2, f"{self.name}: {text}\n".encode())
 
 
 def use_devices(config: ResolvedConfig, options: RunOptions) -> int:
-    """Start JAX, together with the other processes of the run, and the number of devices of each process that share it.
+    """Start JAX, join the other processes, and return how many devices each process uses.
 
-    Raises ConfigError if there is none of the kind asked for, or they are not there or do not divide worlds or seeds.
+    Raises:
+        ConfigError: the devices do not exist, or do not divide the envs or the seeds.
     """
     join_processes(options)
-    wanted = _wanted(config, options)
+    wanted = _requested(config, options)
     with contextlib.suppress(RuntimeError):  # JAX runs already, and has the devices that it has
         divide_cpu(wanted or _dividing(config, cores(), ENVS_PER_CORE))
-    _start(config)
+    _start_jax(config)
     there, processes = jax.local_device_count(), jax.process_count()
     if wanted is None and processes == 1:
         return _dividing(config, there, ENVS_PER_CORE if jax.default_backend() == "cpu" else 1)
     count = wanted or there
     if count > there:
-        raise invalid(
-            "devices",
-            count,
-            f"at most {there}, which JAX has here (a CPU is divided before JAX starts)",
-        )
+        limit = f"at most {there}, which JAX has here (a CPU is divided before JAX starts)"
+        raise invalid("devices", count, limit)
     if count < there and processes > 1:
-        raise invalid(
-            "devices",
-            count,
-            f"left out with several processes, each of which uses all of its {there}",
-        )
+        raise invalid("devices", count, f"left out: each of several processes uses all {there}")
     if _dividing(config, count * processes, 1) != count * processes:
+        sizes = f"num_envs {config.num_envs} or num_seeds {config.num_seeds}"
         many = f" in each of {processes} processes" if processes > 1 else ""
-        raise invalid(
-            "devices",
-            count,
-            f"a number that divides num_envs {config.num_envs} or num_seeds {config.num_seeds}{many}",
-        )
+        raise invalid("devices", count, f"a number that divides {sizes}{many}")
     return count
 
 
-def _wanted(config: ResolvedConfig, options: RunOptions) -> int | None:
-    """The number of devices that is asked for; a task whose worlds live in this process has one."""
+def _requested(config: ResolvedConfig, options: RunOptions) -> int | None:
+    """Return the number of devices asked for; envs on the host have one."""
     if not spec_of(config.env).on_host:
         return options.devices
     for name, value in (("devices", options.devices), ("num_processes", jax.process_count())):
         if value not in (None, 1):
             raise invalid(
-                name,
-                value,
-                f"1 with {config.env}, whose worlds are stepped one after the other in one process",
+                name, value, f"1 with {config.env}, whose envs are stepped in one process"
             )
     return 1
 
 
-def _dividing(config: ResolvedConfig, most: int, worlds_each: int) -> int:
-    """The largest number of devices up to `most` between which seeds or worlds can be divided evenly."""
+def _dividing(config: ResolvedConfig, most: int, envs_each: int) -> int:
+    """Return the largest number of devices up to `most` that divides seeds or envs evenly."""
 
     def fits(count: int) -> bool:
         seeds = config.num_seeds > 1 and config.num_seeds % count == 0
-        return seeds or (config.num_envs % count == 0 and config.num_envs >= count * worlds_each)
+        return seeds or (config.num_envs % count == 0 and config.num_envs >= count * envs_each)
 
     return next((count for count in range(most, 1, -1) if fits(count)), 1)
 
 
-def _start(config: ResolvedConfig) -> None:
+def _start_jax(config: ResolvedConfig) -> None:
+    wanted = os.environ.get("JAX_PLATFORMS", "")
     try:
         kind = jax.devices()[0].platform
-    except (
-        Exception
-    ) as reason:  # JAX raises many kinds, an AssertionError without a word for a missing plugin
-        wanted, why = os.environ.get("JAX_PLATFORMS", ""), str(reason) or type(reason).__name__
+    except Exception as reason:  # of many kinds; an empty AssertionError for a missing plugin
+        why = str(reason) or type(reason).__name__
         gpu = "" if wanted == "cpu" else 'an NVIDIA GPU needs pip install "dgae_jax[cuda13]"; '
-        raise ConfigError(
-            f"JAX_PLATFORMS={wanted}: must name a device that JAX finds here, cpu for one; {gpu}JAX says: {why}"
-        ) from reason
+        must = "must name a device that JAX finds here, cpu for one"
+        raise ConfigError(f"JAX_PLATFORMS={wanted}: {must}; {gpu}JAX says: {why}") from reason
     if spec_of(config.env).on_host and kind != "cpu":
-        raise ConfigError(
-            f"JAX_PLATFORMS={os.environ.get('JAX_PLATFORMS', '')}: must be cpu with {config.env}; JAX is on the {kind}"
-        )
+        raise ConfigError(f"JAX_PLATFORMS={wanted}: must be cpu with {config.env}, not {kind}")
     if kind != "cpu" and config.physics in ENGINES and ENGINES[config.physics].on_host:
         terminal.warn(
-            f"warning: --physics {config.physics} simulates on the CPU and everything else runs on the {kind}, so that each step crosses"
-            f" between them; --physics jax or JAX_PLATFORMS=cpu keeps all in one place"
+            f"warning: --physics {config.physics} simulates on the CPU, everything else runs on"
+            f" the {kind}; --physics jax or JAX_PLATFORMS=cpu avoids the transfers"
         )
 
 
 def use_cache(cache_dir: str) -> None:
-    """Keep compiled programs in `cache_dir`, or nowhere if it is "none"; raises ConfigError if it cannot be written."""
+    """Keep compiled programs in `cache_dir`, or nowhere if it is "none".
+
+    Raises:
+        ConfigError: it cannot be written.
+    """
     if cache_dir == "none":
         jax.config.update("jax_enable_compilation_cache", False)
         return
@@ -346,52 +328,40 @@ def use_cache(cache_dir: str) -> None:
         path = Path(cache_dir).expanduser()
         path.mkdir(parents=True, exist_ok=True)
     except (OSError, RuntimeError) as reason:
-        raise invalid(
-            "cache_dir", cache_dir, f"a directory that can be written, or none ({reason})"
-        ) from reason
+        allowed = f"a directory that can be written, or none ({reason})"
+        raise invalid("cache_dir", cache_dir, allowed) from reason
     jax.config.update("jax_compilation_cache_dir", str(path))
 
 
 def hardware() -> dict[str, Any]:
-    """What of the machine decides how numbers are rounded."""
+    """Return what decides how numbers are rounded: device, cores, processes, JAX's settings."""
+    on_cpu = jax.default_backend() == "cpu"
+    settings = {name: getattr(jax.config, name, None) for name in JAX_SETTINGS}
     return {
-        "device": f"{jax.default_backend()}: {_model()}",
-        "cores": _cores(),
+        "device": f"{jax.default_backend()}: {_device_model()}",
+        "cores": cores() if on_cpu else None,  # their number decides how sums are split
         "processes": jax.process_count(),
-        "settings": {name: getattr(jax.config, name, None) for name in _SETTINGS}
-        | {"XLA_FLAGS": os.environ.get("XLA_FLAGS")},
+        "settings": settings | {"XLA_FLAGS": os.environ.get("XLA_FLAGS")},
     }
 
 
-def _model() -> str:
-    """Of the device; JAX calls every CPU the same, but compiles for the one it finds."""
+def _device_model() -> str:
+    """Return the model; JAX has one name for all CPUs, but compiles for the one it finds."""
     if jax.default_backend() != "cpu":
         return jax.devices()[0].device_kind
     try:
         lines = Path("/proc/cpuinfo").read_text().splitlines()
-        return next(
-            line.partition(":")[2].strip() for line in lines if line.startswith("model name")
-        )
+        return next(x.partition(":")[2].strip() for x in lines if x.startswith("model name"))
     except (OSError, StopIteration):
         return platform.processor() or platform.machine()
 
 
-def _cores() -> int | None:
-    """Cores this process may use: on a CPU their number decides how sums are split, and so their rounding."""
-    if jax.default_backend() != "cpu":
-        return None
-    return cores()
-
-
 def available_memory() -> int:
-    """Bytes that a run may take: of the device, or of this machine or the control group that this process is in."""
-    limit = (
-        (jax.devices()[0].memory_stats() or {}).get("bytes_limit")
-        if jax.default_backend() != "cpu"
-        else None
-    )
-    if limit:
-        return int(limit)
+    """Return the bytes that a run may take: of the device, or of the machine or control group."""
+    if jax.default_backend() != "cpu":
+        limit = (jax.devices()[0].memory_stats() or {}).get("bytes_limit")
+        if limit:
+            return int(limit)
     total = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
     try:
         return min(total, int(Path("/sys/fs/cgroup/memory.max").read_text()))

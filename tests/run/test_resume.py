@@ -48,7 +48,7 @@ def test_a_run_that_stopped_half_way_ends_with_the_same_bits_and_the_same_metric
         ({"algo": "a2c"}, "algo a2c: must be ppo as in"),
         ({"physics": "jax"}, "physics jax: must be native as in"),
         (
-            {"policy": dataclasses.replace(SMALL.policy, clip=0.3)},
+            {"policy": dataclasses.replace(SMALL.policy, clip_eps=0.3)},
             r"policy\.clip 0\.3: must be 0\.2 as in",
         ),
     ],

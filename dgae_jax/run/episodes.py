@@ -1,0 +1,237 @@
+"""Episodes of trained policies: greedy in Gymnasium and in JAX, sampled for Monte Carlo returns.
+
+The one place that steps episodes outside training; evaluation, calibration and video share it.
+"""
+
+import warnings
+from collections.abc import Callable, Iterator, Sequence
+from functools import lru_cache
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from dgae_jax.configs.resolved import ResolvedConfig
+from dgae_jax.envs.registry import GIVEN, spec_of
+from dgae_jax.learn import play
+from dgae_jax.learn.build import make_greedy, make_policy, make_task, make_trainer
+from dgae_jax.learn.iteration import sampler
+from dgae_jax.learn.parallel import Trainer
+from dgae_jax.learn.rollout import Episodes, rollout, start
+from dgae_jax.learn.types import InferenceState, Transition
+from dgae_jax.run.options import eval_env_id
+from dgae_jax.run.runtime import Watch, compile_in_thread, unwatched
+
+CHUNK = 50
+"""Steps between looks at signals and clock."""
+
+SAMPLED_CHUNK = 100
+"""The same for episodes with sampled actions."""
+
+
+class EvalStep(NamedTuple):
+    """One step of E episodes side by side."""
+
+    obs: np.ndarray
+    """Observations before the step [E, O]."""
+    reward: np.ndarray
+    """Rewards [E], 0 where the episode has ended before."""
+    alive: np.ndarray
+    """Whether each episode goes on after the step [E]."""
+    terminated: np.ndarray
+    """Whether each episode ended in this step other than by a time limit [E]."""
+    snapshots: list[Any]
+    """What `snapshot` returned for each env before the step."""
+
+
+def episode_seeds(seed: int, episodes: int) -> np.ndarray:
+    """Return a 64-bit number per initial state [E]; no other `seed` shares one (chance 2⁻⁶⁴)."""
+    sequences = (np.random.SeedSequence((seed, i)) for i in range(episodes))
+    return np.array([each.generate_state(1, np.uint64)[0] for each in sequences])
+
+
+def make_eval_env(config: ResolvedConfig, max_steps: int | None = None) -> Any:
+    """Return the task in Gymnasium with a time limit, by default that of training."""
+    import gymnasium  # here, so that training alone does not import it
+
+    limit = config.episode_length if max_steps is None else max_steps
+    if spec_of(config.env).gymnasium_id is None:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # that v4 is not the latest version is known
+            return gymnasium.make(eval_env_id(config), max_episode_steps=limit)
+    from dgae_jax.envs.gymnasium import make_world
+
+    return gymnasium.wrappers.TimeLimit(make_world(eval_env_id(config)), limit)
+
+
+def time_limit(config: ResolvedConfig) -> int:
+    """Return the most steps of an episode: the run's limit, or a shorter one of Gymnasium's."""
+    gymnasium_id = spec_of(config.env).gymnasium_id
+    if gymnasium_id is None:
+        return config.episode_length
+    from dgae_jax.envs.gymnasium import make_world
+
+    env = make_world(gymnasium_id)
+    env.close()
+    own = env.spec and env.spec.max_episode_steps
+    return min(config.episode_length, own or config.episode_length)
+
+
+def gymnasium_steps(
+    envs: Sequence[Any],
+    act: Callable[[np.ndarray], np.ndarray],
+    seeds: Sequence[int] | np.ndarray,
+    steps: int | None = None,
+    snapshot: Callable[[Any], Any] | None = None,
+) -> Iterator[EvalStep]:
+    """Play one episode per Gymnasium env, with one batched policy call per step.
+
+    The envs stay open.
+
+    Args:
+        envs: one env per episode.
+        act: `act(obs [E, O]) -> action [E, A]`.
+        seeds: the seed of each initial state.
+        steps: most steps; by default until all episodes have ended.
+        snapshot: called with each env before each step, for example for its `qpos`.
+
+    Yields:
+        The steps of all episodes, until the last one has ended.
+    """
+    pairs = zip(envs, seeds, strict=True)
+    obs = np.stack([env.reset(seed=int(seed))[0] for env, seed in pairs])
+    alive, step = np.full(len(envs), True), 0
+    while alive.any() and (steps is None or step < steps):
+        before, actions = obs.copy(), act(obs.astype(np.float32))
+        snapshots = [snapshot(env) for env in envs] if snapshot else []
+        reward, over = np.zeros(len(envs)), np.full(len(envs), False)
+        for i in map(int, np.flatnonzero(alive)):
+            obs[i], reward[i], over[i], truncated, _ = envs[i].step(actions[i])
+            alive[i] = not (over[i] or truncated)
+        yield EvalStep(before, reward, alive.copy(), over, snapshots)
+        step += 1
+
+
+def gymnasium_returns(
+    policy: InferenceState, config: ResolvedConfig, episodes: int, seed: int, watch: Watch
+) -> np.ndarray:
+    """Return undiscounted returns [E] of the mean action in Gymnasium, side by side."""
+    envs = [make_eval_env(config) for _ in range(episodes)]
+    greedy = _greedy(config, GIVEN.get(config.env))
+    shape = (episodes, *envs[0].observation_space.shape)
+    compile_in_thread(greedy, policy, np.zeros(shape, np.float32), watch=watch)
+
+    def act(obs: np.ndarray) -> np.ndarray:
+        return np.asarray(greedy(policy, obs))
+
+    total = np.zeros(episodes)
+    steps = gymnasium_steps(envs, act, episode_seeds(seed, episodes))
+    for number, step in enumerate(steps):
+        total += step.reward
+        if number % CHUNK == 0:
+            watch(_progress(number, config, int(step.alive.sum())))
+    for env in envs:
+        env.close()
+    return total
+
+
+def _progress(step: int, config: ResolvedConfig, alive: int) -> str:
+    return f"step {step:,} of at most {config.episode_length:,}, {alive} still running"
+
+
+@lru_cache(maxsize=1)
+def _greedy(config: ResolvedConfig, given: Any):
+    """Compile the mean action; `given` is the object that a custom task stands for now."""
+    return jax.jit(make_greedy(make_task(config), config))
+
+
+def jax_returns(
+    policy: InferenceState, config: ResolvedConfig, episodes: int, seed: int, watch: Watch
+) -> np.ndarray:
+    """Return undiscounted returns [E] of the mean action in the physics of `config`."""
+    trainer, advance = _programs(config, GIVEN.get(config.env))
+    envs = _fresh_envs(config, trainer, seed, episodes, watch)
+    now = play.begin(envs)
+    compile_in_thread(advance, policy, now, 1, watch=watch, what="compiling steps")
+    while (step := int(now.step)) < config.episode_length and (alive := int(now.alive.sum())):
+        watch(_progress(step, config, alive))
+        now = advance(policy, now, min(step + CHUNK, config.episode_length))
+    return np.asarray(now.total, np.float64)
+
+
+@lru_cache(maxsize=1)
+def _programs(
+    config: ResolvedConfig, given: Any
+) -> tuple[Trainer, Callable[[InferenceState, play.Play, int], play.Play]]:
+    env = make_task(config)
+    greedy = make_greedy(env, config)
+
+    def advance(policy: InferenceState, now: play.Play, until: int) -> play.Play:
+        return play.play(env, lambda obs: greedy(policy, obs), now, until)
+
+    return make_trainer(env, 1), jax.jit(advance)
+
+
+def _fresh_envs(
+    config: ResolvedConfig, trainer: Trainer, seed: int, episodes: int, watch: Watch
+) -> Any:
+    """Return env states at the beginning of an episode [E].
+
+    They are taken from fresh training states, whose program is compiled already or will be: a
+    reset of Brax's takes half a minute to compile.
+    """
+    batches = -(-episodes // (config.num_seeds * config.num_envs))
+    sequences = (np.random.SeedSequence((seed, i)) for i in range(batches))
+    numbers = [each.generate_state(config.num_seeds) for each in sequences]
+    keys = [jnp.stack([jax.random.key(int(n)) for n in each]) for each in numbers]
+    compile_in_thread(trainer.init, config, keys[0], watch=watch, what="compiling resets")
+
+    def flat(x: jax.Array) -> jax.Array:
+        return x.reshape(x.shape[0] * x.shape[1], *x.shape[2:])
+
+    envs = [jax.tree.map(flat, trainer.init(config, each).episodes.env) for each in keys]
+    return jax.tree.map(lambda *parts: jnp.concatenate(parts)[:episodes], *envs)
+
+
+def sampled_steps(
+    policy: InferenceState,
+    config: ResolvedConfig,
+    key: jax.Array,
+    num_envs: int,
+    steps: int,
+    watch: Watch = unwatched,
+) -> Iterator[Transition]:
+    """Sample actions in fresh envs without a time limit.
+
+    Args:
+        policy: one policy, without an axis of seeds.
+        config: the run.
+        key: random key.
+        num_envs: number of envs.
+        steps: steps to take, rounded up to whole chunks.
+        watch: told the progress.
+
+    Yields:
+        Transitions [SAMPLED_CHUNK, num_envs].
+    """
+    env = make_task(config)
+    network = make_policy(env, config)
+
+    @jax.jit
+    @jax.default_matmul_precision("highest")  # as in training
+    def advance(
+        policy: InferenceState, episodes: Episodes, keys: jax.Array
+    ) -> tuple[Episodes, Transition]:
+        return rollout(env, sampler(network, policy), episodes, keys, episode_length=2**30)
+
+    begin, draw = jax.random.split(key)
+    episodes = jax.jit(lambda keys: start(env, keys))(jax.random.split(begin, num_envs))
+    chunks = -(-steps // SAMPLED_CHUNK)
+    keys = jax.random.split(draw, (chunks, SAMPLED_CHUNK, num_envs))
+    compile_in_thread(advance, policy, episodes, keys[0], watch=watch)
+    for i in range(chunks):
+        done, total = i * SAMPLED_CHUNK, chunks * SAMPLED_CHUNK
+        watch(f"playing step {done:,} of {total:,} in {num_envs} envs")
+        episodes, step = advance(policy, episodes, keys[i])
+        yield step
