@@ -25,7 +25,7 @@ from dgae_jax.learn.normalizers import OBSERVATION_LIMIT
 from dgae_jax.maths.transport import GAP_BIAS, centered_cumsum
 from dgae_jax.run.api import Policy
 from dgae_jax.run.checkpoint import Networks
-from dgae_jax.run.evaluation import time_limit
+from dgae_jax.run.episodes import time_limit
 from dgae_jax.run.options import eval_env_id
 
 Arrays = dict[str, np.ndarray]

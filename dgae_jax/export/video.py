@@ -21,7 +21,7 @@ from dgae_jax.maths.risk import weights_of
 from dgae_jax.run import checkpoint
 from dgae_jax.run.api import Policy
 from dgae_jax.run.calibration import MAX_RETURN_STEPS, steps_that_count
-from dgae_jax.run.evaluation import episode_seeds
+from dgae_jax.run.episodes import episode_seeds
 from dgae_jax.run.options import eval_env_id
 from dgae_jax.run.runtime import Watch, unwatched
 

@@ -134,7 +134,7 @@ def file_name(steps: int) -> str:
 
 def checkpoints_in(directory: Path) -> list[Path]:
     """Return the checkpoints in a directory, oldest first; no link is followed."""
-    named = (p for p in directory.iterdir() if re.fullmatch(r"steps_\d{12}\.msgpack", p.name))
+    named = (p for p in directory.glob("*") if re.fullmatch(r"steps_\d{12}\.msgpack", p.name))
     return sorted(p for p in named if p.is_file() and not p.is_symlink())
 
 

@@ -67,7 +67,7 @@ def untrained(request, tmp_path_factory):
 
 def make_untrained(name, directory):
     rng, config = np.random.default_rng(0), CONFIGS[name]
-    blank = checkpoint._blank(config)
+    blank = checkpoint._abstract_state(config)
     policy, critic = (
         jax.tree.map(lambda x: rng.normal(0, 0.5, x.shape).astype(x.dtype), each.params)
         for each in (blank.policy, blank.critic)

@@ -1,4 +1,4 @@
-"""A state, a finished run and a copy of it."""
+"""A training state, a finished run and a copy of it."""
 
 import dataclasses
 import shutil
@@ -14,7 +14,7 @@ from tests.runs import QUIET, SMALL, small
 
 @pytest.fixture(scope="session", autouse=True)
 def _compiled_once():
-    """Runs of the same configuration share their program, so that each is traced once."""
+    """Share the program of runs of the same configuration."""
     with pytest.MonkeyPatch.context() as patch:
         for make in (training.make_task, training.make_trainer):
             patch.setattr(training, make.__name__, cache(make))
@@ -29,7 +29,7 @@ def state():
 @pytest.fixture(scope="session")
 def finished(tmp_path_factory):
     run_dir = tmp_path_factory.mktemp("runs") / "finished"
-    train_command(small(), dataclasses.replace(QUIET, run_dir=run_dir))
+    assert train_command(small(), dataclasses.replace(QUIET, run_dir=run_dir)) == 0
     return run_dir
 
 

@@ -27,7 +27,11 @@ def old_run(tmp_path):
 
 def test_old_configuration_is_read_in_new_names():
     config = directory.read_config(LEGACY / "run")
-    assert (config.num_steps, config.gae_lambda, config.policy.options["clip_eps"]) == (16, 0.95, 0.2)
+    assert (config.num_steps, config.gae_lambda, config.policy.options["clip_eps"]) == (
+        16,
+        0.95,
+        0.2,
+    )
 
 
 @pytest.mark.parametrize("name", ["run", "policy.msgpack"])
