@@ -1,6 +1,6 @@
 """Comparisons of groups: intervals, pairs of algorithms, normalised scores, sample efficiency."""
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -81,23 +81,21 @@ def performance_profile(strata: Strata, taus: np.ndarray) -> np.ndarray:
     return np.stack([(scores > tau).mean(-1) for tau in taus], axis=-1)
 
 
-def pairs() -> Iterator[tuple[str, str]]:
-    """Yield each distributional algorithm with the scalar one of the same policy update."""
-    for name, row in ALGORITHMS.items():
-        if row.residual == "distributional":
-            yield from (
-                (name, o)
-                for o, other in ALGORITHMS.items()
-                if (other.residual, other.policy_update) == ("td", row.policy_update)
-            )
+def pairs() -> list[tuple[str, str]]:
+    """Return each distributional algorithm with the scalar one of the same policy update."""
+    return [
+        (one, other)
+        for one, better in ALGORITHMS.items()
+        for other, worse in ALGORITHMS.items()
+        if (better.residual, worse.residual) == ("distributional", "td")
+        and better.policy_update == worse.policy_update
+    ]
 
 
 def improvements(groups: Iterable[Group]) -> list[Improvement]:
-    """Compare distributional and scalar algorithms.
+    """Compare each distributional group with the first scalar one of its task and pair.
 
-    Returns:
-        For each pair, every distributional group of a task against the first scalar group, then
-        the first groups over all tasks.
+    The first distributional groups are compared over all tasks, too.
     """
     groups, out = list(groups), []
     for better, worse in pairs():
@@ -120,11 +118,9 @@ def _improvement(task: str, duels: Sequence[tuple[Group, Group]]) -> Improvement
 
 
 def normalised(groups: Iterable[Group]) -> dict[str, tuple[Group, list[np.ndarray]]]:
-    """Divide final returns by the best mean final return of their task.
+    """Divide final returns by the best mean of their task, if it is positive.
 
-    Returns:
-        By name, a group and the scores [S] of each of its tasks. Tasks without a positive mean
-        return have no scores.
+    By name: a group and the scores [S] of each of its tasks.
     """
     out: dict[str, tuple[Group, list[np.ndarray]]] = {}
     for members in by_task(groups).values():

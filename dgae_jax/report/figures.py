@@ -15,6 +15,7 @@ from matplotlib.ticker import EngFormatter, PercentFormatter
 from dgae_jax.configs.algorithms import ALGORITHMS
 from dgae_jax.configs.parts import CRITICS
 from dgae_jax.report import analysis
+from dgae_jax.report.analysis import Estimate, Improvement
 from dgae_jax.report.groups import Group, by_task
 from dgae_jax.report.results import Published
 from dgae_jax.run import files
@@ -25,28 +26,12 @@ PANEL = (4.5, 3.3)
 # colours of Okabe and Ito, told apart with any colour vision
 COLOURS = {"clip": "#0072B2", "trust-region": "#D55E00", "gradient": "#009E73"}
 """Colours of the policy updates."""
-CUSTOM, PUBLISHED, INK, FAINT = "#56B4E9", "#CC79A7", "#222222", "#777777"
+CUSTOM, PUBLISHED, FAINT = "#56B4E9", "#CC79A7", "#777777"
 
 MARKERS = ("", "o", "s", "^", "D", "v", "P", "X")
 """Markers of groups whose colour and line another group has."""
 
-STYLE: dict[Any, Any] = {
-    "font.size": 9,
-    "axes.titlesize": 10,
-    "axes.spines.top": False,
-    "axes.spines.right": False,
-    "axes.edgecolor": FAINT,
-    "axes.grid": True,
-    "grid.alpha": 0.3,
-    "text.color": INK,
-    "axes.labelcolor": INK,
-    "xtick.color": INK,
-    "ytick.color": INK,
-    "legend.frameon": False,
-    "lines.linewidth": 1.6,
-    "svg.fonttype": "none",  # text stays text
-    "svg.hashsalt": "dgae",  # the same figure gives the same bytes
-}
+STYLE = Path(__file__).parent / "templates" / "figures.mplstyle"
 
 
 class Look(NamedTuple):
@@ -60,11 +45,9 @@ class Look(NamedTuple):
 
 
 def look(algo: str, number: int = 0) -> Look:
-    """Return the look of an algorithm: a colour per policy update, dashed for a scalar critic.
+    """Return the look of a group by its algorithm and its number.
 
-    Args:
-        algo: Name of the algorithm.
-        number: Number of the group among those of the algorithm.
+    The colour is that of the policy update; a line is dashed for a scalar critic.
     """
 
     def kind(name: str) -> tuple[str, bool]:
@@ -82,46 +65,38 @@ class Mark(NamedTuple):
 
     label: str
     look: Look
-    estimate: analysis.Estimate
-    dots: np.ndarray
+    estimate: Estimate
+    dots: np.ndarray = np.empty(0)
 
 
 def learning_curves(groups: Iterable[Group], published: Sequence[Published] = ()) -> Figure:
     """Draw the return during training per task: mean over seeds ± one standard deviation.
 
-    Args:
-        groups: The groups.
-        published: Published results, drawn as crosses up to the samples of the groups.
+    Crosses are published results, up to the number of samples of the groups.
     """
 
     def draw(axes: Axes, members: Sequence[Group]) -> None:
         for group in members:
-            _curve(axes, group)
+            steps, curve = group.curve
+            if curve.size:
+                mean, std = curve.mean(0), curve.std(0, ddof=min(1, len(curve) - 1))
+                _line(axes, group, steps, mean, (mean - std, mean + std), markevery=0.1)
         _crosses(axes, members, published)
         axes.set(xlabel="environment steps", ylabel="episode return")
         axes.xaxis.set_major_formatter(EngFormatter(sep=""))
         axes.margins(x=0.02)
 
-    return _panels(groups, draw, PANEL[1], legend=True)
+    return _panels(by_task(groups), draw, PANEL[1], legend=True)
 
 
-def _curve(axes: Axes, group: Group) -> None:
-    steps, curve = group.curve
-    if curve.size:
-        std = curve.std(0, ddof=min(1, len(curve) - 1))
-        _line(axes, group, steps, curve.mean(0), markevery=0.1)
-        _shade(axes, group, steps, curve.mean(0) - std, curve.mean(0) + std)
-
-
-def _line(axes: Axes, group: Group, x: np.ndarray, y: np.ndarray, markevery: float) -> None:
+def _line(
+    axes: Axes, group: Group, x: np.ndarray, y: np.ndarray, ends: Any, markevery: float
+) -> None:
     colour, line, marker, _ = look(group.algo, group.number)
     style = {"color": colour, "marker": marker, "markevery": markevery, "markersize": 4}
     axes.plot(x, y, line, label=group.name, **style)
-
-
-def _shade(axes: Axes, group: Group, x: np.ndarray, low: np.ndarray, high: np.ndarray) -> None:
-    colour = look(group.algo, group.number).colour
-    axes.fill_between(x, low, high, color=colour, alpha=0.12, linewidth=0)
+    if ends is not None:
+        axes.fill_between(x, *ends, color=colour, alpha=0.12, linewidth=0)
 
 
 def _crosses(axes: Axes, members: Sequence[Group], published: Sequence[Published]) -> None:
@@ -151,7 +126,7 @@ def speed(groups: Iterable[Group]) -> Figure:
 
     def draw(axes: Axes, members: Sequence[Group]) -> None:
         rates = [np.array([row.samples_per_second for row in group.rows]) for group in members]
-        means = [analysis.Estimate(rate.mean(), None) for rate in rates]
+        means = [Estimate(rate.mean(), None) for rate in rates]
         _dots(axes, [_mark(*each) for each in zip(members, means, rates, strict=True)])
         axes.set_xlabel("samples per second")
         axes.set_xlim(0, 1.1 * max(rate.max() for rate in rates))
@@ -160,51 +135,39 @@ def speed(groups: Iterable[Group]) -> Figure:
     return _dot_panels(groups, draw)
 
 
-def improvement(found: Sequence[analysis.Improvement]) -> Figure:
+def improvement(found: Sequence[Improvement]) -> Figure:
     """Draw the probability of improvement per task and pair of algorithms."""
-    marks = [
-        _mark(duel.better, duel.estimate)._replace(
-            label=f"{duel.better.name} > {duel.worse.name}\n{duel.task}"
-        )
-        for duel in found
-    ]
-    with mpl.rc_context(STYLE):
-        figure = _figure(PANEL[0], _height(len(marks), 0.4))
-        axes = figure.subplots()
-        _dots(axes, marks)
+
+    def draw(axes: Axes, duels: Sequence[Improvement]) -> None:
+        names = [f"{duel.better.name} > {duel.worse.name}\n{duel.task}" for duel in duels]
+        _dots(axes, [_mark(duel.better, duel.estimate) for duel in duels])
+        axes.set_yticks(range(len(duels)), names)
         axes.axvline(0.5, color=FAINT, linewidth=1)
-        axes.set(title="Distributional against scalar", xlabel="probability of improvement")
-        axes.set_xlim(-0.03, 1.03)
+        axes.set(xlabel="probability of improvement", xlim=(-0.03, 1.03))
         axes.xaxis.set_major_formatter(PercentFormatter(1))
-    return figure
+
+    return _panels({"Distributional against scalar": found}, draw, _height(len(found), 0.4))
 
 
 def performance_profile(groups: Iterable[Group]) -> Figure:
     """Draw the share of runs above each normalised score, with its interval."""
-    scores = analysis.normalised(groups)
-    top = max((s.max() for _, strata in scores.values() for s in strata), default=1.0)
-    taus = np.linspace(0, 1.05 * top, 200)
-    with mpl.rc_context(STYLE):
-        figure = _figure(*PANEL)
-        axes = figure.subplots()
+
+    def draw(axes: Axes, scores: Mapping[str, tuple[Group, list[np.ndarray]]]) -> None:
+        top = max((s.max() for _, strata in scores.values() for s in strata), default=1.0)
+        taus = np.linspace(0, 1.05 * top, 200)
         for group, strata in scores.values():
             ends = analysis.interval(lambda s: analysis.performance_profile(s, taus), strata)
-            _line(axes, group, taus, analysis.performance_profile(strata, taus), markevery=20)
-            if ends is not None:
-                _shade(axes, group, taus, *ends)
-        axes.set(title="Performance profile", xlabel="normalised score τ")
-        axes.set(ylabel="share of runs above τ", ylim=(-0.02, 1.02))
+            shares = analysis.performance_profile(strata, taus)
+            _line(axes, group, taus, shares, ends, markevery=20)
+        axes.set(xlabel="normalised score τ", ylabel="share of runs above τ", ylim=(-0.02, 1.02))
         axes.yaxis.set_major_formatter(PercentFormatter(1))
-        _legend(figure, [axes])
-    return figure
+
+    scores = analysis.normalised(groups)
+    return _panels({"Performance profile": scores}, draw, PANEL[1], legend=True)
 
 
 def coverage(statistics: Mapping[str, Any]) -> str:
-    """Describe how many returns a critic's central 90 % interval holds.
-
-    Args:
-        statistics: Result of `run.calibration`.
-    """
+    """Describe how many returns a critic's central 90 % interval holds (`run.calibration`)."""
     share = statistics["coverage_90"]
     if math.isnan(share):
         return "fewer than 10 quantiles have no central 90 %"
@@ -219,29 +182,24 @@ def pit_histograms(found: Mapping[str, tuple[str, dict[str, Any]]]) -> Figure:
     Args:
         found: Algorithm and statistics (`run.calibration`) of each critic, by its name.
     """
-    with mpl.rc_context(STYLE):
-        columns = min(3, len(found))
-        rows = -(-len(found) // columns)
-        figure = _figure(PANEL[0] * columns, PANEL[1] * rows)
-        panels = list(figure.subplots(rows, columns, sharey=True, squeeze=False).flat)
-        for axes, (name, (algo, statistics)) in zip(panels, found.items(), strict=False):
-            shares = np.array(statistics["pit"])
-            edges = np.linspace(0, 1, len(shares) + 1)
-            style = {"color": look(algo).colour, "edgecolor": "white", "linewidth": 0.5}
-            axes.bar(edges[:-1], shares, np.diff(edges), align="edge", **style)
-            axes.axhline(1 / len(shares), color=FAINT, linestyle=":", label="calibrated")
-            axes.set(title=f"{name}\n{coverage(statistics)}", ylabel="returns")
-            axes.set_xlabel("share of the quantiles below the observed return")
-            axes.yaxis.set_major_formatter(PercentFormatter(1, decimals=0))
-        for axes in panels[len(found) :]:
-            axes.remove()
-        panels[0].legend()
+
+    def draw(axes: Axes, critic: tuple[str, dict[str, Any]]) -> None:
+        algo, shares = critic[0], np.array(critic[1]["pit"])
+        edges = np.linspace(0, 1, len(shares) + 1)
+        style = {"color": look(algo).colour, "edgecolor": "white", "linewidth": 0.5}
+        axes.bar(edges[:-1], shares, np.diff(edges), align="edge", **style)
+        axes.axhline(1 / len(shares), color=FAINT, linestyle=":", label="calibrated")
+        axes.set(xlabel="share of the quantiles below the observed return", ylabel="returns")
+        axes.yaxis.set_major_formatter(PercentFormatter(1, decimals=0))
+
+    titled = {f"{name}\n{coverage(critic[1])}": critic for name, critic in found.items()}
+    figure = _panels(titled, draw, PANEL[1], columns=3, sharey=True)
+    figure.axes[0].legend()
     return figure
 
 
-def _mark(group: Group, estimate: analysis.Estimate, dots: np.ndarray | None = None) -> Mark:
-    style = look(group.algo, group.number)
-    return Mark(group.name, style, estimate, np.empty(0) if dots is None else dots)
+def _mark(group: Group, estimate: Estimate, *dots: np.ndarray) -> Mark:
+    return Mark(group.name, look(group.algo, group.number), estimate, *dots)
 
 
 def _dots(axes: Axes, marks: Sequence[Mark]) -> None:
@@ -260,45 +218,46 @@ def _dots(axes: Axes, marks: Sequence[Mark]) -> None:
     axes.tick_params(axis="y", length=0)
 
 
-def _figure(width: float, height: float) -> Figure:
-    return Figure(figsize=(width, height), layout="constrained", dpi=150)
-
-
 def _height(rows: int, each: float = 0.28) -> float:
     return 0.9 + each * rows
 
 
-Draw = Callable[[Axes, Sequence[Group]], None]
-
-
-def _dot_panels(groups: Iterable[Group], draw: Draw) -> Figure:
-    groups = list(groups)
-    return _panels(groups, draw, _height(max(map(len, by_task(groups).values()))), legend=False)
-
-
-def _panels(groups: Iterable[Group], draw: Draw, height: float, legend: bool) -> Figure:
-    """Draw a panel per task, two side by side, and one legend for all."""
+def _dot_panels(groups: Iterable[Group], draw: Callable[[Axes, Sequence[Group]], None]) -> Figure:
     tasks = by_task(groups)
-    columns = min(2, len(tasks))
-    rows = -(-len(tasks) // columns)
-    with mpl.rc_context(STYLE):
-        figure = _figure(columns * PANEL[0], rows * height + 0.5 * legend)
+    return _panels(tasks, draw, _height(max(map(len, tasks.values()))))
+
+
+def _panels(
+    contents: Mapping[str, Any],
+    draw: Callable[[Axes, Any], None],
+    height: float,
+    *,
+    columns: int = 2,
+    sharey: bool = False,
+    legend: bool = False,
+) -> Figure:
+    """Draw a panel per content, with its title, and one legend for all."""
+    columns = min(columns, len(contents))
+    rows = -(-len(contents) // columns)
+    with mpl.rc_context(fname=STYLE):
+        size = columns * PANEL[0], rows * height + 0.5 * legend
+        figure = Figure(figsize=size, layout="constrained", dpi=150)
         figure.set_layout_engine("constrained", h_pad=0.1)
-        panels = list(figure.subplots(rows, columns, squeeze=False).flat)
-        for axes, (task, members) in zip(panels, tasks.items(), strict=False):
-            draw(axes, members)
-            axes.set_title(task)
-        for axes in panels[len(tasks) :]:
+        panels = list(figure.subplots(rows, columns, squeeze=False, sharey=sharey).flat)
+        for axes, (title, content) in zip(panels, contents.items(), strict=False):
+            draw(axes, content)
+            axes.set_title(title)
+        for axes in panels[len(contents) :]:
             axes.remove()
         if legend:
-            _legend(figure, panels[: len(tasks)])
+            _legend(figure)
     return figure
 
 
-def _legend(figure: Figure, panels: Sequence[Axes]) -> None:
+def _legend(figure: Figure) -> None:
     """Draw each label once below the panels, colour by colour, so that pairs share a column."""
     handles: dict[str, tuple[str, Any]] = {}
-    for axes in panels:
+    for axes in figure.axes:
         for handle, label in zip(*axes.get_legend_handles_labels(), strict=True):
             line = handle[0] if isinstance(handle, tuple) else handle  # cross of an error bar
             handles.setdefault(label, (line.get_color(), handle))
@@ -332,6 +291,6 @@ def save(figure: Figure, path: Path) -> list[Path]:
 
 def _encoded(figure: Figure, kind: str, **options) -> bytes:
     image = io.BytesIO()
-    with mpl.rc_context(STYLE):
+    with mpl.rc_context(fname=STYLE):
         figure.savefig(image, format=kind, **options)
     return image.getvalue()

@@ -1,8 +1,9 @@
 """Groups of rows: the seeds of one task, one algorithm and the same hyperparameters."""
 
 import json
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass
+from itertools import groupby
 from typing import Any
 
 import numpy as np
@@ -53,8 +54,18 @@ class Group:
 
     @property
     def curve(self) -> tuple[np.ndarray, np.ndarray]:
-        """Steps [P] that all seeds cover and their episode returns [S, P] during training."""
-        return common_curve([(row.curve_steps, row.curve_returns) for row in self.rows])
+        """Steps [P] that all seeds have and their episode returns [S, P] during training.
+
+        Seeds in which no episode ended are left out.
+        """
+        known = [np.isfinite(row.curve_returns) for row in self.rows]
+        curves = [
+            dict(zip(row.curve_steps[finite], row.curve_returns[finite], strict=True))
+            for row, finite in zip(self.rows, known, strict=True)
+            if finite.any()
+        ]
+        steps = sorted(set.intersection(*map(set, curves))) if curves else []
+        return np.array(steps), np.array([[curve[step] for step in steps] for curve in curves])
 
     @property
     def settings(self) -> dict[str, Any]:
@@ -63,12 +74,7 @@ class Group:
 
 
 def groups_of(rows: Iterable[Row]) -> list[Group]:
-    """Group rows by task and algorithm, then by variant and settings in the order of the rows.
-
-    Args:
-        rows: Rows of one sweep; their configurations are compared after the schema upgrade, so
-            that rows of different versions share a group.
-    """
+    """Group rows by task and algorithm, then by variant and settings in the order of the rows."""
     by_kind: dict[tuple[str, str], dict[tuple[str | None, str], list[Row]]] = {}
     for row in sorted(rows, key=order):
         key = row.variant, json.dumps(_settings(row), sort_keys=True)
@@ -83,11 +89,8 @@ def groups_of(rows: Iterable[Row]) -> list[Group]:
 
 
 def by_task(groups: Iterable[Group]) -> dict[str, list[Group]]:
-    """Return the groups of each task."""
-    out: dict[str, list[Group]] = {}
-    for group in groups:
-        out.setdefault(group.task, []).append(group)
-    return out
+    """Return the groups of each task; they must be in the order of `groups_of`."""
+    return {task: list(members) for task, members in groupby(groups, lambda group: group.task)}
 
 
 def order(row: Row) -> tuple:
@@ -102,30 +105,6 @@ def shown(value: Any) -> str:
     if isinstance(value, list):
         return " ".join(map(str, value))
     return "–" if value is None else str(value)
-
-
-def common_curve(
-    curves: Sequence[tuple[np.ndarray, np.ndarray]], points: int = 200
-) -> tuple[np.ndarray, np.ndarray]:
-    """Interpolate curves at the steps that all of them cover.
-
-    Args:
-        curves: Steps [I] and values [I] of each curve, NaN where there is none. Curves without
-            values are left out.
-        points: Number of steps to which those of all curves are thinned, evenly.
-
-    Returns:
-        Steps [P] and values [S, P].
-    """
-    known = [(steps[np.isfinite(values)], values[np.isfinite(values)]) for steps, values in curves]
-    known = [(steps, values) for steps, values in known if len(steps)]
-    if not known:
-        return np.empty(0), np.empty((0, 0))
-    first, last = max(steps[0] for steps, _ in known), min(steps[-1] for steps, _ in known)
-    grid = np.unique(np.concatenate([steps for steps, _ in known]))
-    grid = grid[(grid >= first) & (grid <= last)]
-    grid = grid[np.linspace(0, len(grid) - 1, min(len(grid), points)).round().astype(int)]
-    return grid, np.array([np.interp(grid, steps, values) for steps, values in known])
 
 
 def _settings(row: Row) -> dict[str, Any]:

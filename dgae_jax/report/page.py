@@ -3,17 +3,18 @@
 import base64
 import gc
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import Any
+from typing import NamedTuple, Self
 
+import numpy as np
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from matplotlib.figure import Figure
 
 from dgae_jax.configs.config import invalid
 from dgae_jax.report import analysis, figures, tables
 from dgae_jax.report.groups import Group, by_task, groups_of, shown
-from dgae_jax.report.results import Published, Sweep
+from dgae_jax.report.results import Published, Row, Sweep
 from dgae_jax.report.tables import NONE, Table
 from dgae_jax.run import files
 from dgae_jax.run.terminal import counted
@@ -38,7 +39,7 @@ def write(sweeps: Sequence[Sweep], out: Path, published: Sequence[Published] = (
         written = []
         for number, sweep in enumerate(sweeps, start=1):
             prefix = f"{number}-" if len(sweeps) > 1 else ""
-            for name, figure in _drawn(groups_of(sweep.rows), published):
+            for name, figure in drawn(groups_of(sweep.rows), published):
                 written += figures.save(figure, out / (prefix + name))
         gc.collect()  # figures are full of reference cycles
         html = out / "report.html"
@@ -50,7 +51,8 @@ def write(sweeps: Sequence[Sweep], out: Path, published: Sequence[Published] = (
     return [*written, html]
 
 
-def _drawn(groups: list[Group], published: Sequence[Published]) -> Iterator[tuple[str, Figure]]:
+def drawn(groups: list[Group], published: Sequence[Published]) -> Iterator[tuple[str, Figure]]:
+    """Yield the figures that the results of a sweep suffice for, by name."""
     yield "learning", figures.learning_curves(groups, published)
     yield "returns", figures.final_returns(groups)
     if found := analysis.improvements(groups):
@@ -69,56 +71,28 @@ def page(sweeps: Sequence[Sweep], published: Sequence[Published] = ()) -> str:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    environment.filters |= {"counted": counted, "number": tables.number, "some": _some}
-    reports = [_content(sweep, published) for sweep in sweeps]
-    first, *others = reports
-    comparisons = [
-        tables.comparison(first["groups"], other["groups"], (first["name"], other["name"]))
-        for other in others
-    ]
-    return environment.get_template("page.html").render(
-        title=" and ".join(sweep.name for sweep in sweeps),
-        reports=reports,
-        comparisons=comparisons,
-        crosses=bool(published),
-    )
+    environment.filters |= {"counted": counted, "number": tables.number, "svg_uri": _svg_uri}
+    environment.globals |= {"figures": figures, "tables": tables, "settings": _settings}
+    environment.globals |= {"versions": _versions, "videos": _videos}
+    reports = [Content.of(sweep) for sweep in sweeps]
+    return environment.get_template("page.html").render(reports=reports, published=published)
 
 
-def _content(sweep: Sweep, published: Sequence[Published]) -> dict[str, Any]:
-    """Return what the template shows of one sweep."""
-    groups = groups_of(sweep.rows)
-    tasks = by_task(groups)
-    envs = {row.env for row in sweep.rows}
-    known = [one for one in published if one.task in envs]
-    duels, scores = analysis.improvements(groups), analysis.normalised(groups)
+class Content(NamedTuple):
+    """A sweep with the comparisons that decide which sections it has."""
 
-    def per_task(draw: Callable[..., Figure], *args: Any) -> list[tuple[list[Group], str]]:
-        return [(members, _svg_uri(draw(members, *args))) for members in tasks.values()]
+    sweep: Sweep
+    groups: list[Group]
+    tasks: dict[str, list[Group]]
+    improvements: list[analysis.Improvement]
+    scores: dict[str, tuple[Group, list[np.ndarray]]]
 
-    return {
-        "name": sweep.name,
-        "rows": sweep.rows,
-        "missing": sweep.missing,
-        "diverged": [f"seed {seed} of {run}" for run, seed in sweep.diverged],
-        "steps": sorted({row.total_steps for row in sweep.rows}),
-        "engines": sorted({row.engine for row in sweep.rows}),
-        "groups": groups,
-        "duels": duels,
-        "scores": scores,
-        "final_returns": per_task(figures.final_returns),
-        "learning_curves": per_task(figures.learning_curves, known),
-        "improvement": _svg_uri(figures.improvement(duels)) if duels else None,
-        "profile": _svg_uri(figures.performance_profile(groups)) if scores else None,
-        "speed": per_task(figures.speed),
-        "returns_table": tables.returns(groups),
-        "published_table": tables.published(known) if known else None,
-        "improvement_table": tables.improvement(duels),
-        "reach_table": tables.reach(groups),
-        "speed_table": tables.speed(groups),
-        "versions_table": _versions(sweep),
-        "settings": _settings(groups),
-        "videos": _videos(sweep, tasks),
-    }
+    @classmethod
+    def of(cls, sweep: Sweep) -> Self:
+        """Return the content for a sweep."""
+        groups = groups_of(sweep.rows)
+        found = analysis.improvements(groups)
+        return cls(sweep, groups, by_task(groups), found, analysis.normalised(groups))
 
 
 def _videos(sweep: Sweep, tasks: dict[str, list[Group]]) -> dict[str, str]:
@@ -144,24 +118,19 @@ def _settings(groups: list[Group]) -> list[tuple[Group, Group, Table, set[str]]]
     return found
 
 
-def _versions(sweep: Sweep) -> Table:
+def _versions(rows: Iterable[Row]) -> Table:
     """Count the runs of each version, machine and revision."""
     facts = Counter(
         (name, NONE if value is None else str(value))
-        for row in sweep.rows
+        for row in rows
         for name, value in {
             "git revision": row.git_revision,
             **{f"machine: {name}": value for name, value in row.machine.items()},
             **row.versions,
         }.items()
     )
-    rows = [(*fact, str(count)) for fact, count in sorted(facts.items())]
-    return Table(("name", "value", "runs"), rows)
-
-
-def _some(names: Sequence[str], most: int = 10) -> str:
-    rest = f" and {len(names) - most} more" if len(names) > most else ""
-    return ", ".join(names[:most]) + rest
+    counts = [(*fact, str(count)) for fact, count in sorted(facts.items())]
+    return Table(("name", "value", "runs"), counts)
 
 
 def _svg_uri(figure: Figure) -> str:

@@ -220,15 +220,16 @@ class Published(NamedTuple):
 def published() -> list[Published]:
     """Return the published results of published.csv."""
     with Path(__file__).with_name("published.csv").open(newline="") as file:
-        return [
-            Published(
-                task=row["task"],
-                samples=int(row["samples"]),
-                algorithm=row["algorithm"],
-                mean=float(row["mean"]),
-                spread=float(row["spread"]) if row["spread"] else None,
-                seeds=int(row["seeds"]) if row["seeds"] else None,
-                source=row["source"],
-            )
-            for row in csv.DictReader(file)
-        ]
+        rows = list(csv.reader(file))[1:]
+    return [
+        Published(
+            task,
+            int(samples),
+            algorithm,
+            float(mean),
+            float(spread) if spread else None,
+            int(seeds) if seeds else None,
+            source,
+        )
+        for task, samples, algorithm, mean, spread, seeds, source in rows
+    ]

@@ -50,14 +50,8 @@ def row(env="hopper", algo="dppo", seed=0, **changes):
 def plain(scores, env="hopper", algo="dppo", **changes):
     """Rows with these final returns, one per seed."""
     return [
-        row(
-            env,
-            algo,
-            seed,
-            **{"final": {"engine": "gymnasium", "return_mean": score, "returns": [score]}}
-            | changes,
-        )
-        for seed, score in enumerate(scores)
+        row(env, algo, seed, **{"final": {"engine": "gymnasium", **final}} | changes)
+        for seed, final in enumerate({"return_mean": x, "returns": [x]} for x in scores)
     ]
 
 

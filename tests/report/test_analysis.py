@@ -7,7 +7,6 @@ import pytest
 from scipy import stats
 
 from dgae_jax.report import analysis
-from dgae_jax.report.groups import common_curve
 from tests.report.rows import plain, row
 
 
@@ -53,10 +52,6 @@ def test_rows_of_two_schemas_share_a_group(grouped):
     assert [each.seed for each in group.rows] == [0, 1]
 
 
-def test_pairs_are_the_papers():
-    assert list(analysis.pairs()) == [("dppo", "ppo"), ("dtrpo", "trpo"), ("da2c", "a2c")]
-
-
 def test_improvement_is_estimated_per_task_and_over_common_tasks(grouped):
     rows = (
         plain([1, 3], "hopper", "dppo")
@@ -79,12 +74,6 @@ def test_improvement_counts_ties_half_and_agrees_with_scipy():
     found = analysis.improvement(list(x), list(y))
     assert found.value == pytest.approx(won, rel=1e-14)
     assert found.interval[0] < won < found.interval[1]
-
-
-def test_difference_is_second_minus_first_and_both_are_drawn():
-    found = analysis.difference(np.array([1.0, 3.0]), np.array([10.0, 10.0]))
-    assert found.value == 8
-    np.testing.assert_array_equal(found.interval, [7, 9])
 
 
 def test_single_seed_has_no_interval():
@@ -127,28 +116,15 @@ def test_samples_to_reach_are_those_of_the_mean_over_seeds(grouped):
         "DPPO": [10, None],
         "A2C": [None, None],
     }
-    for none in (None, -3.0, 0.0):
-        assert analysis.reached(groups[0], none) == [None, None]
+    assert analysis.reached(groups[0], -3.0) == [None, None]
 
 
-def test_curves_are_interpolated_at_the_steps_that_all_cover():
-    one = np.array([10.0, 20, 30, 40]), np.array([np.nan, 2, 3, 4])
-    two = np.array([15.0, 25, 35]), np.array([0.0, 10, 20])
-    steps, values = common_curve([one, two])
-    np.testing.assert_array_equal(steps, [20, 25, 30, 35])  # one's first value to two's last
-    np.testing.assert_array_equal(values, [[2, 2.5, 3, 3.5], [5, 10, 15, 20]])
+def test_curve_has_the_steps_that_all_seeds_have(grouped):
+    def seed(number, *values):
+        return row(seed=number, curve={"steps": [10, 20, 30], "return": list(values)})
 
-
-def test_curves_without_values_or_common_steps_are_empty():
-    steps, none = np.array([1.0, 2]), np.array([np.nan, np.nan])
-    assert common_curve([(steps, none)])[1].shape == (0, 0)
-    assert common_curve([(steps, none), (steps, steps)])[1].tolist() == [[1, 2]]
-    at, values = common_curve([(steps, steps), (steps + 5, steps)])
-    assert (at.size, values.size) == (0, 0)
-
-
-def test_many_steps_are_thinned_and_the_first_and_last_stay():
-    steps = np.arange(1.0, 1001)
-    at, values = common_curve([(steps, steps**2)])
-    assert (len(at), at[0], at[-1]) == (200, 1, 1000)
-    np.testing.assert_array_equal(values[0], at**2)
+    (group,) = grouped([seed(0, None, 2, 3), seed(1, 4, 5, 6), seed(2, None, None, None)])
+    steps, values = group.curve
+    assert (steps.tolist(), values.tolist()) == ([20, 30], [[2, 3], [5, 6]])
+    (group,) = grouped([seed(0, None, None, None)])
+    assert group.curve[1].size == 0

@@ -8,7 +8,7 @@ from matplotlib.image import imread
 
 from dgae_jax.configs.algorithms import ALGORITHMS, Row
 from dgae_jax.configs.parts import CRITICS, UPDATES
-from dgae_jax.report import analysis, figures
+from dgae_jax.report import analysis, figures, page
 from dgae_jax.report.figures import look
 from dgae_jax.report.results import Published
 from tests.report.rows import plain, row, whole
@@ -82,12 +82,6 @@ def test_final_returns_are_ticks_of_seeds_a_bar_and_a_dot(grouped):
     assert drawn == [*ppo, *dppo]  # a single seed has no bar
 
 
-def test_profile_starts_with_all_runs_and_ends_with_none(grouped):
-    (axes,) = figures.performance_profile(grouped(plain([1, 3]))).axes
-    shares = axes.lines[0].get_xydata()
-    np.testing.assert_array_equal(shares[[0, -1], 1], [1, 0])
-
-
 def test_pit_histogram_has_a_panel_per_critic_with_its_coverage():
     found = {"a": ("dppo", {"pit": [0.5, 0.5], "coverage_90": 0.874})}
     found["b"] = ("dtrpo", {"pit": [0.25, 0.75], "coverage_90": float("nan")})
@@ -101,25 +95,16 @@ NO_CURVE = {"steps": [1, 2], "return": [None, None]}
 
 AWKWARD = {
     "noisy env without a version": [row() | {"env": "brax:ant", "env_version": None}],
-    "missing runs": [row("ant", "ppo", 0), row("ant", "dppo", 0), row("hopper", "a2c", 0)],
+    "missing runs": [row("ant", "ppo"), row("ant", "dppo"), row("hopper", "a2c")],
     "no episode ended": [row(curve=NO_CURVE), row(curve={"steps": [], "return": []}, cell="b")],
     "negative returns": plain([-5, -3], curve={"steps": [1, 2], "return": [-9, -4]}),
-    "zero returns": plain([0.0, 0.0]),
 }
 
 
 @pytest.mark.parametrize("rows", AWKWARD.values(), ids=AWKWARD)
 def test_awkward_sweeps_are_drawn_without_a_warning(rows, grouped):
     groups = grouped(rows)
-    found = analysis.improvements(groups)
-    drawn = [
-        figures.learning_curves(groups),
-        figures.final_returns(groups),
-        figures.speed(groups),
-        figures.performance_profile(groups),
-        *([figures.improvement(found)] if found else []),
-    ]
-    for figure in drawn:
+    for _, figure in page.drawn(groups, []):
         assert figures.svg(figure).rstrip().endswith(b"</svg>")
 
 

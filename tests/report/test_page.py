@@ -1,10 +1,7 @@
-"""The page, parsed as HTML, and in a browser where there is one."""
+"""The page, parsed as HTML."""
 
 import base64
-import json
 import re
-import shutil
-import subprocess
 from html.parser import HTMLParser
 
 import pytest
@@ -99,13 +96,7 @@ def test_settings_that_differ_from_the_first_of_the_algorithm_are_marked(read):
     second = row("walker2d", "ppo", config=first["config"] | changed)
     found = read([first, second, row("swimmer", "dppo")])
     assert found.text_of("mark") == ["walker2d", "7", "0.5", "3.0"]
-
-
-def test_commands_versions_and_machines_are_listed(read):
-    rows = whole(("hopper",), ("ppo",), 2)
-    found = read(rows)
-    (commands,) = found.text_of("pre")
-    assert all(each["command"] in commands for each in rows)
+    assert first["command"] in found.text_of("pre")[0]
     assert {"jax", "0.10.2", "machine: device", "git revision"} <= set(found.words)
 
 
@@ -113,16 +104,10 @@ def test_summary_counts_runs_and_names_those_without_a_result(tmp_path):
     diverged = row(seed=1, final={"engine": "jax", "return_mean": None, "returns": [None]})
     path = study(tmp_path / "some", [row(), diverged], planned=["hopper-dppo-2"])
     (summary,) = re.findall("<p>(.*?)</p>", page([results.read(path)]), re.DOTALL)
-    numbers = "1 trained run:\n1 task,\n1 algorithm,\n1 seed,\n1,000,000 environment steps each."
-    assert numbers in summary
+    words = "1 trained run: 1 task, 1 algorithm, 1 seed, 1,000,000 environment steps each."
+    assert words in " ".join(summary.split())
     assert "hopper-dppo-2." in summary
     assert "seed 1 of hopper-dppo-1." in summary
-
-
-def test_single_algorithm_has_no_pairs_and_no_link_to_them(read):
-    found = read([row()])
-    assert any(word.endswith("[–]") for word in found.words)
-    assert "Probability of improvement" not in found.words
 
 
 def test_video_of_a_task_is_embedded(tmp_path):
@@ -155,34 +140,3 @@ def test_sweeps_are_compared_first(read):
     ids = found.values("id")
     assert len(ids) == len(set(ids))
     assert {link["href"][1:] for link in found.all("a")} <= set(ids)
-
-
-NAMES = ("chromium", "chromium-browser", "google-chrome", "chrome")
-CHROMIUM = next(filter(None, map(shutil.which, NAMES)), None)
-
-FRAME = """<!DOCTYPE html><body>
-<iframe src="page.html" style="width: 390px; height: 844px; border: 0" onload="
-  const page = this.contentDocument, root = page.documentElement;
-  const broken = [...page.images].filter(image => !image.naturalWidth).length;
-  document.body.dataset.seen = JSON.stringify([root.clientWidth, root.scrollWidth, broken]);
-"></iframe></body>"""
-"""A frame can be as narrow as a phone; a window cannot."""
-
-
-@pytest.mark.skipif(CHROMIUM is None, reason="no chromium is on the PATH")
-def test_page_fits_a_phone_and_the_console_is_silent(read, tmp_path):
-    text = read(whole(("ant", "hopper"), seeds=2)).source.replace("<details>", "<details open>")
-    (tmp_path / "page.html").write_text(text)
-    (tmp_path / "frame.html").write_text(FRAME)
-    argv = "--headless --no-sandbox --disable-gpu --hide-scrollbars --allow-file-access-from-files"
-    argv += f" --user-data-dir={tmp_path}/profile --enable-logging=stderr --dump-dom"
-    command = [
-        CHROMIUM,
-        *argv.split(),
-        "--virtual-time-budget=5000",
-        f"{tmp_path.as_uri()}/frame.html",
-    ]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=120, check=True)
-    seen = json.loads(re.findall(r'data-seen="([^"]*)"', done.stdout)[0])
-    assert seen == [390, 390, 0]
-    assert "CONSOLE" not in done.stderr

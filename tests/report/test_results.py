@@ -22,18 +22,13 @@ def test_row_is_what_the_file_says(tmp_path):
     curve = {"steps": [5, 10], "return": [None, 2.5]}
     final = {"engine": "gymnasium", "return_mean": 7, "returns": [9, 5]}
     written = row("hopper", "ppo", 3, curve=curve, final=final, seconds=9.5)
-    (read,) = results.read(study(tmp_path, [written])).rows
+    read, other = results.read(study(tmp_path, [written, row(best=None)])).rows
     assert (read.run, read.task, read.algo, read.seed) == ("hopper-ppo-3", "hopper-v4", "ppo", 3)
     assert (read.seconds, read.final, read.returns.tolist()) == (9.5, 7.0, [9, 5])
     np.testing.assert_array_equal(read.curve_steps, [5, 10])
     np.testing.assert_array_equal(read.curve_returns, [np.nan, 2.5])
-    assert read.best == written["best"]["return_mean"]
+    assert (read.best, other.best) == (written["best"]["return_mean"], None)
     assert read.config | {"schema": 3} == written["config"]
-
-
-def test_run_without_evaluations_has_no_best(tmp_path):
-    (read,) = results.read(study(tmp_path, [row(best=None)])).rows
-    assert read.best is None
 
 
 def test_configuration_of_an_older_schema_is_upgraded(tmp_path):
@@ -91,16 +86,11 @@ UNEVEN = "curve: must have increasing steps and a return for each"
     ("change", "sentence"),
     [
         ({"algo": "sac"}, "algo: must be one of ppo, dppo, trpo, dtrpo, a2c, da2c"),
-        ({"algo": ["ppo"]}, "algo: must be a string"),
         ({"seed": True}, "seed: must be a whole number"),
         ({"env_version": 4}, "env_version: must be a string or null"),
         ({"seconds": None}, "seconds: must be a number"),
+        ({"seconds": float("inf")}, "seconds: must be a number"),
         ({"final": None}, "final.engine: missing"),
-        ({"final": {"engine": "x", "returns": []}}, "final.return_mean: missing"),
-        (
-            {"final": {"engine": "x", "return_mean": float("inf")}},
-            "final.return_mean: must be a number",
-        ),
         ({"best": {"steps": 5}}, "best.return_mean: missing"),
         ({"curve": {"steps": [1, 2], "return": [1.0]}}, UNEVEN),
         ({"curve": {"steps": [2, 2], "return": [1.0, 2.0]}}, UNEVEN),
@@ -111,15 +101,6 @@ UNEVEN = "curve: must have increasing steps and a return for each"
 def test_wrong_field_is_named_with_what_it_must_be(change, sentence, tmp_path):
     directory = study(tmp_path, [row() | change])
     assert refusal(directory) == f"{directory}/results.jsonl line 1: {sentence}"
-
-
-@pytest.mark.parametrize("name", ["cell", "variant", "curve", "config", "command"])
-def test_missing_field_is_named(name, tmp_path):
-    data = row()
-    study(tmp_path, [data])
-    del data[name]
-    (tmp_path / "results.jsonl").write_text(json.dumps(data) + "\n")
-    assert refusal(tmp_path).endswith(": missing")
 
 
 def test_run_whose_return_is_not_finite_is_left_out_with_a_warning(tmp_path, capsys):
