@@ -35,7 +35,7 @@ BLOCKS = [
     pytest.param(block[2], id=f"{path.name}:{number}", marks=[pytest.mark.slow] * slow)
     for path, text in TEXTS.items()
     for number, block in enumerate(FENCE.finditer(text), 1)
-    for slow in [bool(SLOW.search(block[2])) and path.name != "README.md"]
+    for slow in [bool(SLOW.search(block[2]))]
     if block[1] == "python"
 ]
 
