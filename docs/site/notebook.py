@@ -13,7 +13,7 @@ from pygments.formatters import HtmlFormatter
 from pygments.lexers import PythonLexer
 
 FOLDER = Path(__file__).parent.parent.parent / "notebooks"
-PYTHON, HTML = PythonLexer(), HtmlFormatter(cssclass="highlight")
+PYTHON, HTML = PythonLexer(), HtmlFormatter(cssclass="highlight", wrapcode=True)
 
 
 def block(source: str, *_: Any, **__: Any) -> str:
@@ -40,7 +40,7 @@ def _output(output: dict[str, Any]) -> str:
         return markdown.markdown("".join(data["text/markdown"]), extensions=["tables"])
     if "text/html" in data:
         return "".join(data["text/html"])
-    return f"<pre>{html.escape(''.join(data['text/plain']))}</pre>"
+    return f"<pre><code>{html.escape(''.join(data['text/plain']))}</code></pre>"
 
 
 def _linked(text: str) -> str:
