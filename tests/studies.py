@@ -1,63 +1,45 @@
-"""Small studies, for the tests of what trains many runs."""
+"""Small sweeps and tunings by the real commands."""
 
-import json
 import subprocess
 import sys
+import time
 
 from dgae_jax.run import metrics
 from tests.helpers import ROOT, TINY
 
-SHAPE = [
-    *TINY,
-    "--envs",
-    "hopper",
-    "--algos",
-    "ppo",
-    "dppo",
-    "--seeds",
-    "0",
-    "1",
-    "--total-steps",
-    str(64 * 10),
-    "--episodes",
-    "2",
-]
-"""Four cells of ten iterations."""
+SHAPE = [*TINY, "--envs", "hopper", "--algos", "ppo", "--episodes", "2"]
 
 TIMES = ("seconds", "samples_per_second", "command")
-"""What differs between two studies of the same cells."""
+"""Fields that differ between two sweeps of the same runs."""
 
 
-def start(study, *more):
-    """The real command."""
-    words = [
-        sys.executable,
-        "experiments/reproduce.py",
-        str(study),
-        *SHAPE,
-        "--checkpoint-every",
-        "320",
-        *more,
-    ]
-    return subprocess.Popen(
-        words, cwd=ROOT, text=True, stdout=subprocess.PIPE, stderr=subprocess.PIPE
-    )
+def command(*words):
+    """Start a Python program with its arguments."""
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
+    return subprocess.Popen([sys.executable, *map(str, words)], cwd=ROOT, text=True, **pipes)
+
+
+def start(sweep, *more, steps=10, seeds=(0, 1), program=("experiments/reproduce.py",)):
+    """Start a sweep of runs of so many iterations, with a checkpoint at half of them."""
+    shape = [*SHAPE, "--total-steps", 64 * steps, "--checkpoint-every", 32 * steps]
+    return command(*program, sweep, *shape, "--seeds", *seeds, *more)
 
 
 def finish(process):
-    """Exit code, lines and errors."""
+    """Return the exit code, the lines and the errors of a process."""
     out, err = process.communicate(timeout=500)
     return process.returncode, out.splitlines(), err
 
 
-def rows(study):
-    """Of the results, without their times."""
-    return [
-        {k: v for k, v in row.items() if k not in TIMES}
-        for row in metrics.read(study / "results.jsonl")
-    ]
+def wait_for(what, seconds=240):
+    """Wait until a condition holds."""
+    deadline = time.monotonic() + seconds
+    while not what():
+        assert time.monotonic() < deadline
+        time.sleep(0.05)
 
 
-def cells(study):
-    """Names of a study's cells."""
-    return list(json.loads((study / "study.json").read_text())["cells"])
+def rows(sweep):
+    """Return the results without their times."""
+    found = metrics.read(sweep / "results.jsonl")
+    return [{k: v for k, v in row.items() if k not in TIMES} for row in found]

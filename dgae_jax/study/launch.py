@@ -111,15 +111,12 @@ def ray_cluster(jobs: Sequence[Job], options: LaunchOptions) -> Iterator[Tasks]:
     """
     import ray  # pyright: ignore[reportMissingImports]
 
+    quiet: Any = {"log_to_driver": False, "logging_level": logging.ERROR}
     try:
-        ray.init(
-            options.address or "local",
-            log_to_driver=False,
-            logging_level=logging.ERROR,
-            ignore_reinit_error=True,
-        )
+        ray.init(options.address or "local", ignore_reinit_error=True, **quiet)
     except (ConnectionError, RuntimeError, ValueError) as reason:
-        raise _no_cluster(options.address, str(reason).partition("\n")[0][:200]) from reason
+        allowed = f"where a Ray cluster answers ({str(reason).splitlines()[0][:200]})"
+        raise invalid("address", options.address, allowed) from reason
     resources: Any = {"num_cpus": options.cpus_per_run, "num_gpus": options.gpus_per_run}
     task = ray.remote(max_retries=-1, **resources)(execute)
     try:
@@ -136,15 +133,12 @@ def _check_ray(options: LaunchOptions) -> None:
         raise invalid("address", address, "HOST:PORT of a cluster, or auto")
     if not find_spec("ray"):
         raise invalid("launcher", "ray", 'used with Ray installed: pip install "dgae_jax[ray]"')
-    if is_remote:
+    if is_remote:  # ray.init waits for minutes where nobody answers
         try:
             socket.create_connection((host, int(port)), timeout=5.0).close()
         except (OSError, OverflowError) as reason:
-            raise _no_cluster(address, reason) from reason
-
-
-def _no_cluster(address: str | None, reason: Any) -> ConfigError:
-    return invalid("address", address, f"where a Ray cluster answers ({reason})")
+            allowed = f"where a Ray cluster answers ({reason})"
+            raise invalid("address", address, allowed) from reason
 
 
 SLURM_EXECUTOR = "slurm"

@@ -3,6 +3,7 @@
 import base64
 import csv
 import io
+import warnings
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -103,7 +104,8 @@ def _png(study: Study, draw: Callable[..., Any]) -> str:
     """Return one of Optuna's plots as base64."""
     image = io.BytesIO()
     pyplot.switch_backend("agg")
-    with pyplot.style.context("default"):
+    with pyplot.style.context("default"), warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of experimental functions, and of axes without an extent
         axes = draw(study, target_name="mean return")
         figure = (axes if hasattr(axes, "figure") else axes.flat[0]).figure
         figure.savefig(image, format="png", dpi=120, bbox_inches="tight")

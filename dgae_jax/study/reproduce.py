@@ -7,13 +7,9 @@ import sys
 import time
 from collections import Counter
 from collections.abc import Sequence
-from typing import NamedTuple
 
 import jax
-import numpy as np
-from rich.console import Console, Group
-from rich.live import Live
-from rich.table import Table
+from rich.console import Console
 
 from dgae_jax.run import terminal
 from dgae_jax.run.options import RunOptions
@@ -96,102 +92,70 @@ def _failure(sweep: Sweep, run: RunSpec, task: Task) -> str | None:
 
 
 def _summary(run: RunSpec, rows: results.Rows) -> str:
-    std = rows[0]["final"]["return_std"] or 0.0
-    spread = f" ± {std:,.1f}" if len(rows) == 1 else f", mean of {len(rows)} seeds"
-    speed = f"{rows[0]['samples_per_second']:,.0f} steps/s"
-    return f"{run.name}: return {results.mean_return(rows):,.1f}{spread}, {speed}"
+    means = [row["final"]["return_mean"] for row in rows]
+    shown = " ".join("not finite" if mean is None else f"{mean:,.1f}" for mean in means)
+    return f"{run.name}: return {shown}, {rows[0]['samples_per_second']:,.0f} steps/s"
 
 
-class Reached(NamedTuple):
-    """How far a run is."""
-
-    steps: int
-    episode_return: float | None
-
-
-def reached(sweep: Sweep, run: RunSpec) -> Reached:
-    """Read the last whole row of the metrics of a run."""
+def reached(sweep: Sweep, run: RunSpec) -> int:
+    """Return the steps in the last whole row of the metrics of a run."""
     try:
         with (sweep.run_dir(run) / "metrics.jsonl").open("rb") as file:
             file.seek(max(0, file.seek(0, os.SEEK_END) - TAIL))
-            last = json.loads(file.read().rpartition(b"\n")[0].rpartition(b"\n")[2])
-        return Reached(int(last["steps"]), last["episode_return"])
+            return json.loads(file.read().rpartition(b"\n")[0].rpartition(b"\n")[2])["steps"]
     except (OSError, ValueError, LookupError, TypeError):
-        return Reached(0, None)
+        return 0
 
 
 class Progress:
-    """Shows how far the runs are: a table on a terminal, lines elsewhere."""
+    """Shows how far the runs are, as a status line on a terminal and as lines elsewhere."""
 
     def __init__(self, sweep: Sweep, runs: Sequence[RunSpec]):
         self.sweep, self.runs = sweep, runs
         self.state = {run.name: "waiting" for run in runs}
-        self.start = {run.name: reached(sweep, run).steps for run in runs}
+        self.start = {run.name: reached(sweep, run) for run in runs}
         self.began = self.printed = time.monotonic()
         console = Console(file=terminal.Steady(sys.stdout))
-        self.live = Live(console=console, auto_refresh=False) if terminal.is_live() else None
+        self.status = console.status("") if terminal.is_live() else None
 
     def __enter__(self) -> "Progress":
-        if self.live:
-            self.live.start()
+        if self.status:
+            self.status.start()
         return self
 
     def __exit__(self, *_) -> None:
-        self.show()
-        if self.live:
-            self.live.stop()
+        if self.status:
+            self.status.stop()
 
     def note(self, run: RunSpec, state: str, text: str) -> None:
         """Note that a run is done or has failed, and print a line about it."""
         self.state[run.name] = state
-        if self.live:
-            self.live.console.print(text, markup=False, highlight=False)
+        if self.status:
+            self.status.console.print(text, markup=False, highlight=False)
         else:
             terminal.say(text)
 
     def show(self) -> None:
         """Read what the runs have written, and show it."""
-        if not self.live and time.monotonic() - self.printed < PLAIN_EVERY:
-            return
-        far = {run.name: reached(self.sweep, run) for run in self.runs}
-        for name, state in self.state.items():
-            if state == "waiting" and far[name].steps > self.start[name]:
-                self.state[name] = "running"
-        if self.live:
-            self.live.update(Group(self._line(far), self._table(far)), refresh=True)
-        else:
+        if self.status:
+            self.status.update(self._line())
+        elif time.monotonic() - self.printed > PLAIN_EVERY:
             self.printed = time.monotonic()
-            terminal.say(self._line(far))
+            terminal.say(self._line())
 
-    def _line(self, far: dict[str, Reached]) -> str:
-        count = Counter(self.state.values())
-        states = [s for s in ("done", "running", "waiting", "failed") if count[s]]
-        ours = [run for run in self.runs if self.state[run.name] != "failed"]
-        total = sum(_steps(run) * run.config.num_seeds for run in ours)
-        there = sum(far[run.name].steps * run.config.num_seeds for run in ours)
-        made = there - sum(self.start[run.name] * run.config.num_seeds for run in ours)
-        left = (total - there) * (time.monotonic() - self.began) / made if made else None
-        eta = "time left unknown" if left is None else f"about {terminal.clock(left)} left"
-        counts = ", ".join(f"{count[s]} {s}" for s in states)
-        return f"{counts} of {len(self.runs)} runs; {there:,} of {total:,} steps, {eta}"
-
-    def _table(self, far: dict[str, Reached]) -> Table:
-        table = Table(box=None, pad_edge=False)
-        for name in ("env", "algorithm", "done", "running", "failed", "steps", "return"):
-            table.add_column(name, justify="left" if name in ("env", "algorithm") else "right")
-        groups: dict[tuple[str, str], list[RunSpec]] = {}
+    def _line(self) -> str:
+        done = made = total = 0
         for run in self.runs:
-            groups.setdefault((run.config.env, run.label), []).append(run)
-        for names, runs in groups.items():
-            states = Counter(self.state[run.name] for run in runs)
-            share = np.mean([far[run.name].steps / _steps(run) for run in runs])
-            returns = [far[run.name].episode_return for run in runs]
-            known = [x for x in returns if x is not None]
-            counts = [str(states[state] or "") for state in ("done", "running", "failed")]
-            mean = f"{np.mean(known):,.0f}" if known else "–"
-            table.add_row(*names, *counts, f"{share:.0%}", mean)
-        return table
-
-
-def _steps(run: RunSpec) -> int:
-    return run.config.iterations * run.config.samples_per_iteration
+            steps, seeds = reached(self.sweep, run), run.config.num_seeds
+            if self.state[run.name] == "waiting" and steps > self.start[run.name]:
+                self.state[run.name] = "running"
+            if self.state[run.name] != "failed":
+                done += steps * seeds
+                made += (steps - self.start[run.name]) * seeds
+                total += run.config.iterations * run.config.samples_per_iteration * seeds
+        left = (total - done) * (time.monotonic() - self.began) / made if made else None
+        clock = "time left unknown" if left is None else f"about {terminal.clock(left)} left"
+        counts = ", ".join(
+            f"{n} {state}" for state, n in sorted(Counter(self.state.values()).items())
+        )
+        return f"{counts} of {len(self.runs)} runs; {done:,} of {total:,} steps, {clock}"

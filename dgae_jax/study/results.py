@@ -1,7 +1,6 @@
 """`results.jsonl`: the results of a sweep, a row per trained seed, and the final policies."""
 
 import json
-import math
 from pathlib import Path
 from typing import Any
 
@@ -123,9 +122,3 @@ def _write_policy(run_dir: Path, config: ResolvedConfig, path: Path) -> None:
         return
     found = checkpoint.load_networks(run_dir, config, "latest")
     checkpoint.save_networks(path, config, found, checkpoint.reward_std(found.path, config))
-
-
-def mean_return(rows: Rows) -> float:
-    """Return the mean final return over seeds; NaN if one of them is not finite."""
-    means = [row["final"]["return_mean"] for row in rows]
-    return float(np.mean([math.nan if x is None else x for x in means]))

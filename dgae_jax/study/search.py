@@ -6,6 +6,7 @@ choice. Widths of layers are written `64x64`. Nothing here imports JAX.
 """
 
 import dataclasses
+import json
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -23,17 +24,8 @@ Distribution = FloatDistribution | IntDistribution | CategoricalDistribution
 Space = dict[str, Distribution]
 """The values of each setting, by its dotted path."""
 
-FIXED = (
-    "env",
-    "env_version",
-    "algo",
-    "physics",
-    "seed",
-    "num_seeds",
-    "total_steps",
-    "episode_length",
-)
-"""Settings that all trials share, because they say what is measured."""
+FIXED = ("env", "env_version", "algo", "physics", "total_steps", "episode_length")
+"""Settings that all trials share, because they say what is measured; seeds are shared too."""
 
 FIRST_SEED = 1000
 """First seed of the trials; reports use 0, 1, …, which no choice of settings has seen."""
@@ -93,7 +85,7 @@ def space_of(words: Sequence[str], config: ResolvedConfig) -> Space:
     for word in words:
         name, _, text = word.partition("=")
         path = name.replace("-", "_")
-        if path in FIXED:
+        if path in (*FIXED, "seed", "num_seeds"):
             raise invalid("search", word, f"of another setting: all trials share {path}")
         if path in space:
             raise invalid("search", word, f"the only range of {path}")
@@ -119,10 +111,8 @@ def with_values(config: ResolvedConfig, values: Mapping[str, Any]) -> ResolvedCo
 def values_of(config: ResolvedConfig, space: Space) -> dict[str, Any]:
     """Return the values of the searched settings, as a trial keeps them."""
     values = {path: config.as_config().get(path) for path in space}
-    return {
-        path: "x".join(map(str, value)) if isinstance(value, tuple) else value
-        for path, value in values.items()
-    }
+    layers = {k: "x".join(map(str, v)) for k, v in values.items() if isinstance(v, tuple)}
+    return values | layers
 
 
 def shown(distribution: Distribution) -> str:
@@ -150,14 +140,11 @@ def _distribution(text: str) -> Distribution:
 
 
 def _value(text: str) -> Any:
-    if text.lower() in ("true", "false"):
-        return text.lower() == "true"
-    for kind in (int, float):
-        try:
-            return kind(text)
-        except ValueError:
-            continue
-    return text
+    """Parse a choice as JSON, or else as a name."""
+    try:
+        return json.loads(text)
+    except ValueError:
+        return text
 
 
 def _setting(path: str, value: Any) -> Any:

@@ -14,10 +14,8 @@ import signal
 import sys
 import time
 import warnings
-from collections.abc import Callable
 from dataclasses import replace
 from multiprocessing.process import BaseProcess
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -92,11 +90,10 @@ def open_study(tuning: Tuning, worker: int = 0) -> Study:
     """
     optuna.logging.set_verbosity(optuna.logging.ERROR)
     url = tuning.storage or f"sqlite:///{tuning.directory.absolute() / 'optuna.db'}"
-    wait = {"connect_args": {"timeout": LOCK_TIMEOUT}}
     try:
         storage = RDBStorage(
             url,
-            engine_kwargs={"pool_pre_ping": True} if tuning.storage else wait,
+            engine_kwargs={} if tuning.storage else {"connect_args": {"timeout": LOCK_TIMEOUT}},
             heartbeat_interval=tuning.heartbeat,
             grace_period=3 * tuning.heartbeat,
             heartbeat_stale_trial_callback=_retry,
@@ -134,13 +131,12 @@ def _retry(study: Study, trial: FrozenTrial) -> None:
 
 def _check_same(study: Study, tuning: Tuning) -> None:
     """Write what is tuned, or refuse to tune anything else in this study."""
-    options = tuning.options
     ours = {
         **flat(json.loads(json.dumps(to_dict(tuning.config)))),
         **{f"search {path}": shown(each) for path, each in tuning.space.items()},
         "tuning_seeds": tuning.seeds,
-        "episodes": options.episodes,
-        "eval_engine": engine_of(tuning.config, options.eval_engine),
+        "episodes": tuning.options.episodes,
+        "eval_engine": engine_of(tuning.config, tuning.options.eval_engine),
     }
     theirs = study.user_attrs.get("tuning")
     if theirs is None:
@@ -153,33 +149,27 @@ def _check_same(study: Study, tuning: Tuning) -> None:
 
 def _run_workers(tuning: Tuning, study: Study, signals: Signals) -> None:
     """Run processes until enough trials are finished, all of them fail or a signal came."""
-    said = {trial.number for trial in study.trials}
-    processes: list[BaseProcess] = []
+    said = {trial.number for trial in study.get_trials(states=FINISHED)}
     while not signals.received and _count(study, FINISHED) < tuning.trials:
         optuna.storages.fail_stale_trials(study)
         missing = tuning.trials - _count(study, UNDER_WAY)
-        processes = [start_worker(tuning, n) for n in range(min(missing, tuning.workers))]
-        _wait(processes, signals, lambda: _say_finished(study, said))
-        for number, process in enumerate(processes):
-            if process.exitcode and not signals.received:
-                code, log = process.exitcode, _log(tuning, number)
-                terminal.warn(f"worker {number} ended with exit code {code}, see {log}")
-        if processes and all(process.exitcode for process in processes):
+        workers = [start_worker(tuning, n) for n in range(min(missing, tuning.workers))]
+        is_told = False
+        while running := [worker for worker in workers if worker.is_alive()]:
+            if signals.received and not is_told:
+                is_told = True
+                for worker in running:
+                    os.kill(worker.pid or 0, signals.received)
+            _say_finished(study, said)
+            time.sleep(POLL)
+        for number, worker in enumerate(workers):
+            if worker.exitcode and not signals.received:
+                log = f"{tuning.directory}/worker-{number}.log"
+                terminal.warn(f"worker {number} ended with exit code {worker.exitcode}, see {log}")
+        if workers and all(worker.exitcode for worker in workers):
             break
-        time.sleep(POLL)  # others may be at work on the last trials
-
-
-def _wait(processes: list[BaseProcess], signals: Signals, look: Callable[[], None]) -> None:
-    """Wait until all processes have ended; pass a signal on to them."""
-    is_told = False
-    while running := [process for process in processes if process.is_alive()]:
-        if signals.received and not is_told:
-            is_told = True
-            for process in running:
-                os.kill(process.pid or 0, signals.received)
-        look()
-        time.sleep(POLL)
-    look()
+        time.sleep(POLL)  # other machines may be at work on the last trials
+        _say_finished(study, said)
 
 
 def _count(study: Study, states: tuple[TrialState, ...]) -> int:
@@ -209,9 +199,9 @@ def _work(tuning: Tuning, number: int) -> None:
     if hasattr(os, "sched_getaffinity"):
         cores = sorted(os.sched_getaffinity(0))
         os.sched_setaffinity(0, cores[number :: tuning.workers])
-    log = os.open(_log(tuning, number), os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o666)
-    os.dup2(log, 1)
-    os.dup2(log, 2)
+    with (tuning.directory / f"worker-{number}.log").open("ab") as log:
+        os.dup2(log.fileno(), 1)
+        os.dup2(log.fileno(), 2)
     terminal.prepare()
     code = work(tuning, number)
     sys.stdout.flush()
@@ -291,7 +281,3 @@ def _suggest(trial: Trial, path: str, distribution: Distribution) -> Any:
     is_whole = isinstance(distribution, IntDistribution)
     suggest: Any = trial.suggest_int if is_whole else trial.suggest_float
     return suggest(path, distribution.low, distribution.high, log=distribution.log)
-
-
-def _log(tuning: Tuning, number: int) -> Path:
-    return tuning.directory / f"worker-{number}.log"

@@ -19,7 +19,7 @@ from typing import NamedTuple
 from dgae_jax.configs.config import ConfigError
 from dgae_jax.run import terminal
 from dgae_jax.run.directory import InUseError
-from dgae_jax.run.options import RunOptions, read_options, saved_options
+from dgae_jax.run.options import RunOptions
 from dgae_jax.study import sweep as sweeps
 from dgae_jax.study.sweep import RunSpec, Sweep
 
@@ -46,9 +46,8 @@ def execute(job: Job, cores: Sequence[int] = (), lifeline: int = subprocess.PIPE
     Returns:
         The exit code of the run.
     """
-    options = saved_options(job.options)
-    options |= {"cache_dir": job.options.cache_dir, "inexact": job.options.inexact}
-    words = [str(job.sweep.path.absolute()), job.run.name, json.dumps(options), *map(str, cores)]
+    options = json.dumps(dataclasses.asdict(job.options))
+    words = [str(job.sweep.path.absolute()), job.run.name, options, *map(str, cores)]
     with job.sweep.log(job.run).open("ab") as log:
         process = subprocess.Popen(
             [sys.executable, "-m", __name__, *words],
@@ -68,19 +67,10 @@ def main() -> int:
     if cores:
         os.sched_setaffinity(0, map(int, cores))
     threading.Thread(target=_stop_when_abandoned, daemon=True).start()
-    sweep, chosen = sweeps.read(Path(path)), json.loads(options)
+    sweep = sweeps.read(Path(path))
     run = next(each for each in sweep.runs if each.name == name)
-    return _train(
-        run,
-        dataclasses.replace(
-            read_options(chosen),
-            run_dir=sweep.run_dir(run),
-            resume_or_start=True,
-            num_processes=1,
-            cache_dir=chosen["cache_dir"],
-            inexact=chosen["inexact"],
-        ),
-    )
+    where = {"run_dir": sweep.run_dir(run), "resume_or_start": True, "num_processes": 1}
+    return _train(run, RunOptions(**{**json.loads(options), **where}))
 
 
 def _stop_when_abandoned() -> None:
@@ -92,17 +82,15 @@ def _stop_when_abandoned() -> None:
 def _train(run: RunSpec, options: RunOptions) -> int:
     from dgae_jax.run import training  # after the cores are set
 
-    since = time.monotonic()
+    deadline = time.monotonic() + IN_USE_TIMEOUT
     while True:
         try:
             return training.train_command(run.config, options)
         except ConfigError as mistake:
-            waited = time.monotonic() - since
-            if isinstance(mistake, InUseError) and waited < IN_USE_TIMEOUT:
-                time.sleep(0.5)
-                continue
-            terminal.warn(f"error: {mistake}")
-            return 2
+            if not isinstance(mistake, InUseError) or time.monotonic() > deadline:
+                terminal.warn(f"error: {mistake}")
+                return 2
+            time.sleep(0.5)
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""Every algorithm learns: returns after a short training are far above those of a policy that does not."""
+"""Every algorithm learns: a short training raises the return far above that of random actions."""
 
 import dataclasses
 
@@ -9,13 +9,12 @@ from dgae_jax.run.api import train
 from tests.runs import QUIET
 
 FLOORS = {"ppo": 330, "dppo": 1200, "trpo": 1000, "dtrpo": 1000, "a2c": 700, "da2c": 900}
-"""Return on Hopper, about half of the lower of two seeds when this was written or less: 673, 2,457, 2,793, 2,493, 1,495 and 1,981. Random
-actions get 18."""
+"""About half of the lower return of two seeds on Hopper, or less. Random actions get 18."""
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("algo", FLOORS)
-def test_150_000_samples_of_hopper_teach_an_algorithm_to_hop(algo):
+def test_an_algorithm_learns_to_hop_from_150_000_samples(algo):
     config = dataclasses.replace(
         preset("tuned", algo, "hopper"), physics="native", total_steps=150_000, num_seeds=2
     )
