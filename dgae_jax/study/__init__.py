@@ -1,1 +1,1 @@
-"""Many runs: which there are, who runs them, what came of them."""
+"""Sweeps of runs, and tunings of their hyperparameters."""

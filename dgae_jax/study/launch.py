@@ -1,8 +1,8 @@
 """Launchers of a sweep: this machine, a Ray cluster or Slurm.
 
-A launcher is `launch(jobs, options)`, a context in which all jobs are on their way: a dictionary
-of tasks with `done()` and `result()`, the exit code of the run. On leaving it, runs that are not
-done stop with a checkpoint; those of Slurm go on.
+A launcher is `launch(jobs, options)`, a context in which all jobs are on their way. The result of
+a task is the exit code of its run. On leaving the context, runs that are not done stop with a
+checkpoint; those of Slurm continue.
 """
 
 import contextlib
@@ -16,7 +16,7 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from importlib.util import find_spec
-from typing import Any, Protocol
+from typing import Any
 
 from dgae_jax.configs.config import ConfigError, invalid
 from dgae_jax.configs.validation import lookup
@@ -26,7 +26,7 @@ from dgae_jax.study.worker import Job, execute
 
 @dataclass(frozen=True)
 class LaunchOptions:
-    """Where the runs of a sweep are trained."""
+    """The launcher of a sweep and its settings."""
 
     launcher: str = "local"
     """local (this machine), ray (a cluster) or slurm (an array of jobs)."""
@@ -45,19 +45,9 @@ class LaunchOptions:
     [NAME=VALUE]."""
 
 
-class Task(Protocol):
-    """A run on its way."""
+Tasks = dict[Any, Job]
+"""By task; a task has the methods `done` and `result` of `concurrent.futures.Future`."""
 
-    def done(self) -> bool:
-        """Return whether there is a result."""
-        ...
-
-    def result(self) -> int:
-        """Return the exit code of the run; raise what kept it from having one."""
-        ...
-
-
-Tasks = dict[Task, Job]
 Launcher = Callable[[Sequence[Job], LaunchOptions], AbstractContextManager[Tasks]]
 Launch = Callable[[Sequence[Job]], AbstractContextManager[Tasks]]
 """A launcher with its options."""
@@ -105,9 +95,9 @@ def _shares(processes: int) -> list[list[int]]:
 
 @contextlib.contextmanager
 def ray_cluster(jobs: Sequence[Job], options: LaunchOptions) -> Iterator[Tasks]:
-    """Run jobs as tasks of a Ray cluster whose nodes share the sweep's directory.
+    """Run jobs as tasks of a Ray cluster; the nodes share the directory of the sweep.
 
-    A task whose node dies is retried on another, and resumes from the checkpoint of its run.
+    If a node dies its tasks are retried on another, and resume from the checkpoints of their runs.
     """
     import ray  # pyright: ignore[reportMissingImports]
 
@@ -133,7 +123,7 @@ def _check_ray(options: LaunchOptions) -> None:
         raise invalid("address", address, "HOST:PORT of a cluster, or auto")
     if not find_spec("ray"):
         raise invalid("launcher", "ray", 'used with Ray installed: pip install "dgae_jax[ray]"')
-    if is_remote:  # ray.init waits for minutes where nobody answers
+    if is_remote:  # ray.init waits for minutes
         try:
             socket.create_connection((host, int(port)), timeout=5.0).close()
         except (OSError, OverflowError) as reason:
@@ -159,7 +149,7 @@ class _ResumableJob:
 
 @contextlib.contextmanager
 def slurm_array(jobs: Sequence[Job], options: LaunchOptions) -> Iterator[Tasks]:
-    """Run jobs as one Slurm array, which goes on when this process ends."""
+    """Run jobs as one Slurm array, which outlives this process."""
     import submitit
 
     folder = jobs[0].sweep.path / "slurm" / "%j"

@@ -5,7 +5,7 @@ import csv
 import io
 import warnings
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any
 
 import jinja2
 import optuna.visualization.matplotlib as plots
@@ -28,19 +28,12 @@ _TEMPLATES = jinja2.Environment(
 )
 
 
-class Plot(NamedTuple):
-    """One of Optuna's plots."""
-
-    draw: Callable[..., Any]
-    least: int
-    """Different returns that it needs."""
-
-
-PLOTS = {
-    "Return of each trial, and the best so far": Plot(plots.plot_optimization_history, 1),
-    "Share of the spread that each setting explains": Plot(plots.plot_param_importances, 4),
-    "Return by setting": Plot(plots.plot_slice, 1),
+PLOTS: dict[str, tuple[Callable[..., Any], int]] = {
+    "Return of each trial, and the best so far": (plots.plot_optimization_history, 1),
+    "Share of the spread that each setting explains": (plots.plot_param_importances, 4),
+    "Return by setting": (plots.plot_slice, 1),
 }
+"""By title: Optuna's function, and the number of different returns that it needs."""
 
 
 def settings_of(trial: FrozenTrial) -> dict[str, str]:
@@ -62,26 +55,27 @@ def write(tuning: Tuning, study: Study) -> int:
         terminal.warn(f"all {len(trials)} trials were pruned or diverged; see {log}")
         return 1
     files.write_json(best_file, to_dict(tuning.best_config(best[0].params)))
-    rows = [
-        [str(trial.number), f"{trial.value:,.1f}", *settings_of(trial).values()]
-        for trial in best[:TOP]
-    ]
-    head = ["trial", "return", *best[0].params]
-    returns = {trial.value for trial in best}
+    table = [["trial", "return", *tuning.space]]
+    for trial in best[:TOP]:
+        settings = settings_of(trial)
+        values = (settings[path] for path in tuning.space)
+        table.append([str(trial.number), f"{trial.value:,.1f}", *values])
+    count = len({trial.value for trial in best})
     page = _TEMPLATES.get_template("tuning.html").render(
         tuning=tuning,
         first_seed=FIRST_SEED,
         trials=len(trials),
         search={path: shown(each) for path, each in tuning.space.items()},
         engine=engine_of(tuning.config, tuning.options.eval_engine),
-        head=head,
-        rows=rows,
-        plots={title: _png(study, p.draw) for title, p in PLOTS.items() if len(returns) >= p.least},
+        table=table,
+        plots={
+            title: _png(study, draw) for title, (draw, least) in PLOTS.items() if count >= least
+        },
         best=best_file,
     )
     files.replace(tuning.directory / "tuning.html", page.encode())
-    widths = [max(map(len, column)) for column in zip(head, *rows, strict=True)]
-    for row in (head, *rows):
+    widths = [max(map(len, column)) for column in zip(*table, strict=True)]
+    for row in table:
         terminal.say("  ".join(map(str.rjust, row, widths)))
     where = f"all of them in {tuning.directory / 'trials.csv'}, plots in tuning.html"
     terminal.say(f"{len(trials)} trials, {len(trials) - len(best)} of them pruned; {where}")

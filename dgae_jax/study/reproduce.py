@@ -5,8 +5,8 @@ import json
 import os
 import sys
 import time
-from collections import Counter
 from collections.abc import Sequence
+from typing import Any
 
 import jax
 from rich.console import Console
@@ -15,7 +15,7 @@ from dgae_jax.run import terminal
 from dgae_jax.run.options import RunOptions
 from dgae_jax.run.runtime import Signals
 from dgae_jax.study import results
-from dgae_jax.study.launch import Launch, Task
+from dgae_jax.study.launch import Launch
 from dgae_jax.study.sweep import RunSpec, Sweep
 from dgae_jax.study.worker import Job
 
@@ -33,7 +33,7 @@ def reproduce(sweep: Sweep, runs: Sequence[RunSpec], options: RunOptions, launch
     """Train the runs that are not done, and keep `results.jsonl` up to date.
 
     Args:
-        sweep: the sweep, which nobody else has open.
+        sweep: the sweep, opened by this process.
         runs: those of its runs that are asked for.
         options: options of every run.
         launch: the launcher.
@@ -72,13 +72,13 @@ def reproduce(sweep: Sweep, runs: Sequence[RunSpec], options: RunOptions, launch
     if signals.received:
         terminal.say(f"stopped by {signals.name}; the same command continues")
         return signals.exit_code
-    failed = [name for name, state in progress.state.items() if state == "failed"]
+    failed = [name for name, state in progress.ended.items() if state == "failed"]
     for name in failed:
         terminal.warn(f"failed: {name}, see {sweep.path / 'logs' / name}.log")
     return 1 if failed else 0
 
 
-def _failure(sweep: Sweep, run: RunSpec, task: Task) -> str | None:
+def _failure(sweep: Sweep, run: RunSpec, task: Any) -> str | None:
     """Return why a run has no result, by the last line of its log."""
     try:
         code = task.result()
@@ -111,10 +111,9 @@ class Progress:
     """Shows how far the runs are, as a status line on a terminal and as lines elsewhere."""
 
     def __init__(self, sweep: Sweep, runs: Sequence[RunSpec]):
-        self.sweep, self.runs = sweep, runs
-        self.state = {run.name: "waiting" for run in runs}
-        self.start = {run.name: reached(sweep, run) for run in runs}
+        self.sweep, self.runs, self.ended = sweep, runs, dict[str, str]()
         self.began = self.printed = time.monotonic()
+        self.steps_before = self._steps()
         console = Console(file=terminal.Steady(sys.stdout))
         self.status = console.status("") if terminal.is_live() else None
 
@@ -129,7 +128,7 @@ class Progress:
 
     def note(self, run: RunSpec, state: str, text: str) -> None:
         """Note that a run is done or has failed, and print a line about it."""
-        self.state[run.name] = state
+        self.ended[run.name] = state
         if self.status:
             self.status.console.print(text, markup=False, highlight=False)
         else:
@@ -143,19 +142,16 @@ class Progress:
             self.printed = time.monotonic()
             terminal.say(self._line())
 
+    def _steps(self) -> int:
+        return sum(reached(self.sweep, run) * run.config.num_seeds for run in self.runs)
+
     def _line(self) -> str:
-        done = made = total = 0
-        for run in self.runs:
-            steps, seeds = reached(self.sweep, run), run.config.num_seeds
-            if self.state[run.name] == "waiting" and steps > self.start[run.name]:
-                self.state[run.name] = "running"
-            if self.state[run.name] != "failed":
-                done += steps * seeds
-                made += (steps - self.start[run.name]) * seeds
-                total += run.config.iterations * run.config.samples_per_iteration * seeds
-        left = (total - done) * (time.monotonic() - self.began) / made if made else None
-        clock = "time left unknown" if left is None else f"about {terminal.clock(left)} left"
-        counts = ", ".join(
-            f"{n} {state}" for state, n in sorted(Counter(self.state.values()).items())
-        )
-        return f"{counts} of {len(self.runs)} runs; {done:,} of {total:,} steps, {clock}"
+        configs = [run.config for run in self.runs]
+        total = sum(c.iterations * c.samples_per_iteration * c.num_seeds for c in configs)
+        steps, seconds = self._steps(), time.monotonic() - self.began
+        made = steps - self.steps_before
+        clock = terminal.clock((total - steps) * seconds / made) if made else "unknown"
+        states = list(self.ended.values())
+        counts = f"{states.count('done')} done, {states.count('failed')} failed"
+        of = f"of {len(self.runs)} runs; {steps:,} of {total:,} steps"
+        return f"{counts} {of}, time left {clock}"

@@ -25,7 +25,7 @@ def is_done(sweep: Sweep, run: RunSpec) -> bool:
 def read(sweep: Sweep) -> dict[str, Rows]:
     """Return the rows of the runs that are done, by name.
 
-    A run whose directory is not here, but on another machine, keeps the rows that it has.
+    A run keeps its rows if its directory is on another machine.
     """
     path = sweep.path / "results.jsonl"
     before: dict[str, Rows] = {}

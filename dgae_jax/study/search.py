@@ -1,4 +1,4 @@
-"""What a tuning searches: settings, and the values of each as an Optuna distribution.
+"""Search space of a tuning: settings, and the values of each as an Optuna distribution.
 
 `gamma=0.95:0.999` is a range, `policy.learning_rate=log:1e-4:1e-2` one on a logarithmic scale,
 `num_envs=int:4:64` (or `int:log:4:64`) one of whole numbers and `critic.minibatches=16,32,64` a
@@ -76,7 +76,7 @@ def space_of(words: Sequence[str], config: ResolvedConfig) -> Space:
 
     Args:
         words: `SETTING=VALUES`, as in the docstring of this module.
-        config: the configuration whose settings are searched.
+        config: values of all other settings.
 
     Raises:
         ConfigError: a setting is unknown, fixed or has no effect, or a value is invalid.

@@ -42,7 +42,7 @@ QUARTERS = 4
 """Parts of a trial; at the end of each but the last a trial worse than the median is pruned."""
 
 MAX_RETRIES = 5
-"""Times that a trial is retried whose process was lost, perhaps because of its settings."""
+"""Retries of a trial after its process is lost, perhaps because of its settings."""
 
 LOCK_TIMEOUT = 60
 """Longest wait for another process that writes to the same SQLite file [s]."""
