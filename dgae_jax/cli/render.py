@@ -169,9 +169,9 @@ def _render(arguments: Arguments, configs: list[ResolvedConfig]) -> int:
     else:
         runs = list(zip(_titles(paths), paths, configs, strict=True))
         scenes = video.of_runs(runs, arguments.checkpoint or "latest", arguments.index, clip)
-    stem, size = _stem(arguments), video.Size(arguments.width, arguments.height)
+    stem, size = _stem(arguments), (arguments.width, arguments.height)
     with Reporter() as reporter:
-        frames = video.frames(scenes, size, arguments.fps, reporter.watch)
+        frames = video.frames(scenes, *size, arguments.fps, reporter.watch)
         try:
             written = encoding.write(
                 frames, stem, encoding.FORMATS[arguments.format], arguments.fps

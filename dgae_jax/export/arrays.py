@@ -69,7 +69,7 @@ def arrays_of(found: Networks, config: ResolvedConfig, index: int) -> Arrays:
 
 
 def to_npz(arrays: Arrays) -> bytes:
-    """Return the bytes of an `.npz` file."""
+    """Return the bytes of a `.npz` file."""
     file = io.BytesIO()
     np.savez(file, **arrays)  # pyright: ignore[reportArgumentType]
     return file.getvalue()

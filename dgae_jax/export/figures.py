@@ -3,7 +3,7 @@
 import io
 from pathlib import Path
 from statistics import NormalDist
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax.numpy as jnp
 import matplotlib
@@ -85,24 +85,11 @@ def robots() -> Figure:
     return figure
 
 
-class Distances(NamedTuple):
-    """Distances between two distributions U and V."""
-
-    wasserstein: float
-    """Of order 1; symmetric."""
-    forward: float
-    """The directional metric d(F_U, G_V), positive when U is superior."""
-    backward: float
-    """d(G_V, F_U)."""
-
-
-def distances(u: NormalDist, v: NormalDist) -> Distances:
-    """Measure distances on the quantile midpoints."""
+def distances(u: NormalDist, v: NormalDist) -> list[float]:
+    """Return the Wasserstein distance, d(F_U, G_V) and d(G_V, F_U) on the quantile midpoints."""
     levels = [float(q) for q in quantile_midpoints(QUANTILES)]
     f, g = (jnp.array([one.inv_cdf(q) for q in levels]) for one in (u, v))
-    return Distances(
-        *map(float, (wasserstein(f, g), directional_metric(f, g), directional_metric(g, f)))
-    )
+    return list(map(float, (wasserstein(f, g), directional_metric(f, g), directional_metric(g, f))))
 
 
 def transport() -> Figure:
@@ -120,10 +107,12 @@ def transport() -> Figure:
             _densities(upper, u, v)
             _distribution_functions(lower, u, v)
             lower.set_xlabel("$x$", labelpad=-8)
-            d = distances(u, v)
-            forward, backward = (f"{{{x:+.2f}".replace("+", "+}").replace("-", "-}") for x in d[1:])
+            d, *signed = distances(u, v)
+            forward, backward = (
+                f"{{{x:+.2f}".replace("+", "+}").replace("-", "-}") for x in signed
+            )
             upper.set_title(
-                f"({letter})  $d_1 = {d.wasserstein:.2f}$,   $d(F_U, G_V) = {forward}$,"
+                f"({letter})  $d_1 = {d:.2f}$,   $d(F_U, G_V) = {forward}$,"
                 f"   $d(G_V, F_U) = {backward}$",
                 fontsize=10,
             )

@@ -58,7 +58,8 @@ class Overlay:
         self._canvas = FigureCanvasAgg(self._figure)
         size = float(np.clip(8 * width / 480, 5.5, 9))
         self._axes = _axes(self._figure, size, _limits(episode))
-        title = shorten(episode.title, int(0.5 * width / (0.85 * size)))
+        most = int(0.5 * width / (0.85 * size))
+        title = episode.title if len(episode.title) <= most else "…" + episode.title[1 - most :]
         self._figure.text(0.02, 0.97, title, size=size + 1, weight="bold", va="top")
         self._numbers = self._figure.text(0.98, 0.97, "", size=size + 1, va="top", ha="right")
         self._moving: list[Any] = []
@@ -132,12 +133,6 @@ def density(
     bandwidth = max(1.06 * quantiles.std() * len(quantiles) ** -0.2, 2 * (x[1] - x[0]))
     kernels = np.exp(-0.5 * ((x[:, None] - quantiles) / bandwidth) ** 2)
     return kernels.mean(-1) / (bandwidth * np.sqrt(2 * np.pi))
-
-
-def shorten(text: str, most: int) -> str:
-    """Cut the middle out of a text of more than `most` characters."""
-    half = max(most - 1, 2) // 2
-    return text if len(text) <= most else f"{text[:half]}…{text[-half:]}"
 
 
 def _limits(episode: Episode) -> tuple[float, float]:

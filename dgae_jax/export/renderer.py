@@ -1,7 +1,5 @@
 """Pictures of a task's robot, drawn by MuJoCo."""
 
-from typing import NamedTuple
-
 import mujoco
 import numpy as np
 from jaxtyping import Float, UInt8
@@ -10,26 +8,13 @@ from dgae_jax.envs import gym_tasks
 from dgae_jax.envs.registry import spec_of
 from dgae_jax.envs.task import load_spec
 
-
-class Camera(NamedTuple):
-    """A view that follows the robot's center of mass in x and y, at constant height."""
-
-    distance: float
-    """From the point it looks at [m]."""
-    elevation: float
-    """Negative from above [degrees]."""
-    azimuth: float
-    """90 looks along y [degrees]."""
-    height: float
-    """Of the point it looks at [m]."""
-
-
 CAMERAS = {
-    "ant": Camera(3.8, -24, 65, 0.35),
-    "hopper": Camera(3.0, -8, 90, 0.7),
-    "swimmer": Camera(4.6, -50, 90, 0.0),
-    "walker2d": Camera(3.2, -8, 90, 0.72),
+    "ant": (3.8, -24, 65, 0.35),
+    "hopper": (3.0, -8, 90, 0.7),
+    "swimmer": (4.6, -50, 90, 0.0),
+    "walker2d": (3.2, -8, 90, 0.72),
 }
+"""Distance [m], elevation and azimuth [degrees] of each camera, and the height it looks at [m]."""
 
 SKY = ((1.0, 1.0, 1.0), (0.80, 0.88, 0.95))
 """The models' own sky is dark, which is lost in print."""
@@ -51,9 +36,8 @@ class Renderer:
 
     def __init__(self, env: str, version: str | None, *, width: int, height: int):
         """Open an OpenGL context for pictures of this size in pixels."""
-        view = CAMERAS[env]
-        self._camera, self._height = mujoco.MjvCamera(), view.height
-        self._camera.distance, self._camera.elevation, self._camera.azimuth = view[:3]
+        self._camera = camera = mujoco.MjvCamera()
+        camera.distance, camera.elevation, camera.azimuth, self._height = CAMERAS[env]
         self.model = _model(env, version, width, height)
         self._data = mujoco.MjData(self.model)
         self._renderer = mujoco.Renderer(self.model, height, width)
@@ -71,7 +55,10 @@ class Renderer:
     def render(
         self, qpos: Float[np.ndarray, " Q"], qvel: Float[np.ndarray, " V"] | None = None
     ) -> UInt8[np.ndarray, "H W 3"]:
-        """Draw the robot at these positions (m, rad) and velocities, by default at rest."""
+        """Draw the robot at these positions (m, rad) and velocities, by default at rest.
+
+        The camera follows its center of mass in x and y.
+        """
         self._data.qpos[:] = qpos
         self._data.qvel[:] = 0 if qvel is None else qvel
         mujoco.mj_forward(self.model, self._data)

@@ -44,17 +44,6 @@ class EnvStates(NamedTuple):
     """Of the next reset: each env has its own, so that resets do not depend on other envs."""
 
 
-class Step(NamedTuple):
-    """The result of a step, before any reset."""
-
-    obs: Float[Array, "N O"]
-    reward: Float[Array, " N"]
-    terminated: Bool[Array, " N"]
-    truncated: Bool[Array, " N"]
-    infos: dict[str, Array]
-    """The task's metrics [N], and `nonfinite`: where action or simulation were not finite."""
-
-
 def _fresh(env: Env, keys: Key[Array, " N"]) -> EnvStates:
     reset, rest = jnp.moveaxis(jax.vmap(jax.random.split)(keys), 1, 0)
     count = len(keys)
@@ -68,11 +57,15 @@ def _reset(env: Env, states: EnvStates, mask: Bool[Array, " N"]) -> EnvStates:
 
 def _step(
     env: Env, limit: int, mode: AutoresetMode, states: EnvStates, action: Float[Array, "N A"]
-) -> tuple[EnvStates, Step]:
+) -> tuple[EnvStates, tuple[Any, ...]]:
     """Take one step in every env, and reset envs after the end of an episode as `mode` says.
 
     As in training, an env that turns non-finite ends its episode as terminated with reward 0, and
     shows the observation before.
+
+    Returns:
+        The states, and what the step showed before any reset: obs [N, O], reward, terminated,
+        truncated [N], and infos, the task's metrics [N] with `nonfinite`.
     """
     before, after = states.env, jax.vmap(env.step)(states.env, action)
     mask = finite((action, after.pipeline_state, after.reward, after.obs, after.done))
@@ -83,7 +76,7 @@ def _step(
     terminated = over | ~mask
     done = terminated | truncated
     new = states._replace(env=after.replace(obs=obs), steps=steps, done=done)
-    step = Step(obs, reward, terminated, truncated, {**metrics, "nonfinite": ~mask})
+    step = obs, reward, terminated, truncated, {**metrics, "nonfinite": ~mask}
     if mode is AutoresetMode.SAME_STEP:
         return _reset(env, new, done), step
     if mode is AutoresetMode.NEXT_STEP:  # a reset takes the place of a step, which shows zeros
@@ -205,17 +198,16 @@ class VectorTask(VectorEnv):
             shape = self.action_space.shape
             raise invalid("actions", f"of shape {actions.shape}", f"of shape {shape}")
         self._states, step = self._step(states, actions)
-        step = jax.tree.map(np.array, step)
-        replaced = (step.terminated | step.truncated) & (self._mode is AutoresetMode.SAME_STEP)
-        infos = _infos(step.infos, ~waiting & ~replaced)
+        obs, reward, terminated, truncated, metrics = jax.tree.map(np.array, step)
+        replaced = (terminated | truncated) & (self._mode is AutoresetMode.SAME_STEP)
+        infos = _infos(metrics, ~waiting & ~replaced)
         if replaced.any():
             final_obs = np.full(self.num_envs, None, object)
             for i in np.flatnonzero(replaced):
-                final_obs[i] = step.obs[i].copy()
-            infos |= {"final_obs": final_obs, "final_info": _infos(step.infos, replaced)}
+                final_obs[i] = obs[i].copy()
+            infos |= {"final_obs": final_obs, "final_info": _infos(metrics, replaced)}
             infos |= {"_final_obs": replaced.copy(), "_final_info": replaced.copy()}
-        reward = step.reward.astype(np.float64)
-        return self._observations(), reward, step.terminated, step.truncated, infos
+        return self._observations(), reward.astype(np.float64), terminated, truncated, infos
 
     def render(self) -> tuple[UInt8[np.ndarray, "H W 3"], ...] | None:
         """Return a picture of each env, or None without a render mode."""

@@ -1,7 +1,6 @@
 """Videos of trained policies: robots side by side, each over an overlay of its critic."""
 
 import math
-import warnings
 from collections.abc import Iterable, Iterator
 from contextlib import ExitStack
 from itertools import zip_longest
@@ -21,8 +20,7 @@ from dgae_jax.maths.risk import weights_of
 from dgae_jax.run import checkpoint
 from dgae_jax.run.api import Policy
 from dgae_jax.run.calibration import MAX_RETURN_STEPS, steps_that_count
-from dgae_jax.run.episodes import episode_seeds
-from dgae_jax.run.options import eval_env_id
+from dgae_jax.run.episodes import episode_seeds, gymnasium_steps, make_eval_env
 from dgae_jax.run.runtime import Watch, unwatched
 
 HOLD = 0.6
@@ -57,26 +55,16 @@ class Clip(NamedTuple):
     """Longest part of an episode, in simulated time [s]."""
 
 
-class Size(NamedTuple):
-    """Even size of each robot's picture, without its overlay [pixels]."""
-
-    width: int
-    height: int
-
-
 def of_runs(
     runs: list[tuple[str, Path, ResolvedConfig]], which: str, index: int, clip: Clip
 ) -> Iterator[list[Episode]]:
     """Play each initial state with the policies of all runs.
 
     Args:
-        runs: title, directory and configuration of each.
+        runs: title, source and configuration of each.
         which: the checkpoint, latest or best.
         index: which of the seeds that were trained together, from 0.
         clip: what is played.
-
-    Raises:
-        ConfigError: as `checkpoint.load_networks`.
     """
     actors = [
         _actor(title, checkpoint.load_networks(path, config, which), config, index)
@@ -88,7 +76,7 @@ def of_runs(
 def of_checkpoints(
     path: Path, config: ResolvedConfig, index: int, clip: Clip
 ) -> Iterator[list[Episode]]:
-    """Play the policy at each checkpoint that the run keeps, oldest first."""
+    """Play the policy at each checkpoint that the run keeps, oldest first; see `of_runs`."""
     for found in checkpoint.load_all_networks(path, config):
         samples = int(found.path.stem.removeprefix("steps_"))
         yield from _play_all([_actor(f"after {samples:,} samples", found, config, index)], clip)
@@ -111,17 +99,23 @@ def play(actor: Actor, seed: int, seconds: float) -> Episode:
     It continues beyond the states returned until rewards no longer count in their discounted
     returns, or the robot falls.
     """
-    config, env = actor.config, _make_env(actor.config)
-    shown = min(config.episode_length, max(1, math.floor(seconds / env.unwrapped.dt)))
-    states, rewards, fell = _steps(env, actor.policy, seed, shown + steps_that_count(config.gamma))
-    obs, qpos, qvel = (np.stack(part[:shown]) for part in zip(*states, strict=True))
-    quantiles = np.sort(actor.policy.quantiles(obs))
+    config = actor.config
+    env = make_eval_env(config, config.episode_length + MAX_RETURN_STEPS)
+    dt = env.unwrapped.dt
+    shown = min(config.episode_length, max(1, math.floor(seconds / dt)))
+    most = shown + steps_that_count(config.gamma)
+    steps = list(gymnasium_steps([env], actor.policy, [seed], most, _pose))
+    env.close()
+    qpos, qvel = map(np.stack, zip(*(step.snapshots[0] for step in steps[:shown]), strict=True))
+    rewards = np.concatenate([step.reward for step in steps])
     followed = lambda_sum(jnp.asarray(rewards), jnp.full(len(rewards), config.gamma))
+    obs = np.concatenate([step.obs for step in steps[:shown]])
+    quantiles = np.sort(actor.policy.quantiles(obs.astype(np.float32)))
     return Episode(
         actor.title,
         config,
-        dt=env.unwrapped.dt,
-        fell=fell and len(states) <= shown,
+        dt,
+        fell=len(steps) <= shown and bool(steps[-1].terminated[0]),
         qpos=qpos,
         qvel=qvel,
         total=np.cumsum([0.0, *rewards])[: len(qpos)],
@@ -131,36 +125,20 @@ def play(actor: Actor, seed: int, seconds: float) -> Episode:
     )
 
 
-def _make_env(config: ResolvedConfig) -> Any:
-    import gymnasium
-
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # that v4 is not the latest version is known
-        return gymnasium.make(
-            eval_env_id(config), max_episode_steps=config.episode_length + MAX_RETURN_STEPS
-        )
-
-
-def _steps(env: Any, policy: Policy, seed: int, most: int) -> tuple[list, list[float], bool]:
+def _pose(env: Any) -> tuple[np.ndarray, np.ndarray]:
     data = env.unwrapped.data
-    obs, _ = env.reset(seed=seed)
-    states, rewards, fell = [], [], False
-    while len(states) < most and not fell:
-        states.append((obs, data.qpos.copy(), data.qvel.copy()))
-        obs, reward, fell, _, _ = env.step(policy(obs))
-        rewards.append(float(reward))
-    env.close()
-    return states, rewards, bool(fell)
+    return data.qpos.copy(), data.qvel.copy()
 
 
 def frames(
-    scenes: Iterable[list[Episode]], size: Size, fps: float, watch: Watch = unwatched
+    scenes: Iterable[list[Episode]], width: int, height: int, fps: float, watch: Watch = unwatched
 ) -> Iterator[Frame]:
     """Draw scenes one after the other, the episodes of each side by side, in simulated time.
 
     Args:
         scenes: from `of_runs` or `of_checkpoints`.
-        size: of each robot's picture.
+        width: of each robot's picture [pixels].
+        height: without its overlay [pixels].
         fps: frames per second.
         watch: told how far it is.
     """
@@ -172,8 +150,10 @@ def frames(
             for episode in scene:
                 task = episode.config.env, episode.config.env_version
                 if task not in renderers:
-                    renderers[task] = stack.enter_context(Renderer(*task, **size._asdict()))
-                columns.append(_panels(episode, renderers[task], size.width, fps))
+                    renderers[task] = stack.enter_context(
+                        Renderer(*task, width=width, height=height)
+                    )
+                columns.append(_panels(episode, renderers[task], width, fps))
             for frame in side_by_side(columns, hold=round(HOLD * fps)):
                 if count % REPORT_EVERY == 0:
                     watch(f"drawing episode {number}, frame {count:,}")
@@ -182,13 +162,7 @@ def frames(
 
 
 def states_shown(states: int, dt: float, fps: float) -> list[int]:
-    """Return the state that each frame shows, the last one that has begun.
-
-    Args:
-        states: how many there are.
-        dt: between two of them [s].
-        fps: frames per second.
-    """
+    """Return the state that each frame shows: the last to begin, of so many at intervals `dt`."""
     frames = max(1, int(states * dt * fps + 1e-6))
     return [*(int(k / (fps * dt) + 1e-6) for k in range(frames - 1)), states - 1]
 

@@ -15,9 +15,9 @@ from numpy.testing import assert_allclose, assert_array_equal
 from PIL import Image, ImageSequence
 
 from dgae_jax.export import encoding, overlay, video
-from dgae_jax.export.overlay import Episode, Overlay, density, shorten
+from dgae_jax.export.overlay import Episode, Overlay, density
 from dgae_jax.export.video import Actor, play, side_by_side, states_shown, tile
-from dgae_jax.run.evaluation import episode_seeds
+from dgae_jax.run.episodes import episode_seeds
 from tests.export.conftest import make_untrained
 from tests.helpers import ROOT
 from tests.runs import QUIET, small
@@ -30,7 +30,7 @@ class Constant:
         self.action = np.array(action, np.float32)
 
     def __call__(self, obs):
-        return self.action
+        return np.broadcast_to(self.action, (len(obs), len(self.action)))
 
     def quantiles(self, obs):
         return np.broadcast_to(np.array([3.0, 1.0, 4.0, 2.0], np.float32), (len(obs), 4))
@@ -229,11 +229,6 @@ def test_density_has_mass_one_and_the_moments_of_the_quantiles():
     moments = [(f * y).sum() * step for f in (1, x, (x - 2) ** 2)]
     assert_allclose(moments, [1, 2, SPREAD.var() + bandwidth**2], rtol=1e-4)
     assert np.isfinite(density(np.zeros(8), x)).all()
-
-
-def test_a_long_title_loses_its_middle():
-    assert shorten("short", 12) == "short"
-    assert shorten("hopper-dppo-16x128-0", 11) == "hoppe…128-0"
 
 
 WIDTH, HEIGHT, FPS = 200, 120, 25
