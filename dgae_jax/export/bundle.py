@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from dataclasses import asdict
 from importlib import resources
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import jinja2
 
@@ -18,19 +18,6 @@ from dgae_jax.run.options import engines_of, eval_env_id
 from dgae_jax.run.terminal import counted
 
 TEMPLATES = resources.files("dgae_jax.export") / "templates"
-
-
-class Metadata(NamedTuple):
-    """The facts about a policy in its run's files; None where they have none."""
-
-    checkpoint: str
-    """Name of the file with the networks."""
-    samples: int | None
-    returns: str | None
-    """Mean and standard deviation of its evaluation."""
-    versions: str
-    """Of the libraries that trained it."""
-    git_revision: str | None
 
 
 def export(
@@ -55,12 +42,13 @@ def export(
     """
     found = checkpoint.load_networks(source, config, which)
     arrays = arrays_of(found, config, index)
-    metadata = metadata_of(source, found.path, config, index)
-    bundles = {
-        kind: _files(kind, arrays, config, metadata)
-        | {"README.md": card(kind, arrays, config, index, metadata, which).encode()}
-        for kind in formats
+    facts = {
+        **facts_of(source, found.path, config, index),
+        "task": eval_env_id(config),
+        "algorithm": config.algo,
+        "best": which == "best",
     }
+    bundles = {kind: _files(kind, arrays, config, index, facts) for kind in formats}
     for kind, contents in bundles.items():
         (out / kind).mkdir(parents=True, exist_ok=True)
         for name, data in contents.items():
@@ -69,38 +57,31 @@ def export(
 
 
 def _files(
-    kind: str, arrays: Arrays, config: ResolvedConfig, metadata: Metadata
+    kind: str, arrays: Arrays, config: ResolvedConfig, index: int, facts: dict[str, Any]
 ) -> dict[str, bytes]:
+    card = {"README.md": model_card(kind, arrays, config, index, facts).encode()}
     if kind == "onnx":
-        facts = {
-            "task": arrays["env"],
-            "algorithm": config.algo,
-            "samples": metadata.samples,
-            "git_revision": metadata.git_revision,
-        }
-        known = {name: str(value) for name, value in facts.items() if value is not None}
-        return {"policy.onnx": onnx_model.serialize(arrays, known)}
+        names = ("task", "algorithm", "samples", "git_revision")
+        metadata = {name: str(facts[name]) for name in names if facts[name] is not None}
+        return {"policy.onnx": onnx_model.serialize(arrays, metadata), **card}
     programs = ("policy.py", "agent.py") if kind == "gymnasium" else ("policy.py",)
     copies = {name: (TEMPLATES / name).read_bytes() for name in programs}
-    return {"policy.npz": to_npz(arrays), **copies}
+    return {"policy.npz": to_npz(arrays), **copies, **card}
 
 
-def card(
-    kind: str, arrays: Arrays, config: ResolvedConfig, index: int, metadata: Metadata, which: str
+def model_card(
+    kind: str, arrays: Arrays, config: ResolvedConfig, index: int, facts: dict[str, Any]
 ) -> str:
-    """Return the model card: what the policy is, how well it does, how the files are used."""
+    """Return the text that says what the policy is, how well it does, how the files are used."""
     source = (TEMPLATES / "card.md").read_text(encoding="utf-8")
     jinja = jinja2.Environment(trim_blocks=True, undefined=jinja2.StrictUndefined)
     noise = {where: std for where, std in asdict(config.noise).items() if std}
     return jinja.from_string(source).render(
-        metadata._asdict(),
+        facts,
         format=kind,
-        task=eval_env_id(config),
-        algo=config.algo,
         trained_on=f"{config.task}, engine {config.physics}, seed {config.seed + index}",
         noise=", ".join(f"{where} {std:g}" for where, std in noise.items()),
         engine=engines_of(config)[0],
-        best=which == "best",
         critic=config.critic.kind,
         gamma=f"{config.gamma:g}",
         scaled=config.normalize_rewards,
@@ -111,8 +92,8 @@ def card(
     )
 
 
-def metadata_of(source: Path, found: Path, config: ResolvedConfig, index: int) -> Metadata:
-    """Read the metadata of a policy.
+def facts_of(source: Path, found: Path, config: ResolvedConfig, index: int) -> dict[str, Any]:
+    """Return what the files of a run say about a policy; None for what they do not say.
 
     Args:
         source: a run directory, or the file of a policy.
@@ -131,13 +112,13 @@ def metadata_of(source: Path, found: Path, config: ResolvedConfig, index: int) -
         evaluation = here[-1] if here else None
     versions, revision = row.get("versions"), str(row.get("git_revision"))
     known = versions.items() if isinstance(versions, dict) else ()
-    return Metadata(
-        checkpoint=found.name,
-        samples=samples if type(samples) is int else None,
-        returns=_returns(evaluation),
-        versions=", ".join(f"{name} {version}" for name, version in known if version is not None),
-        git_revision=revision if re.fullmatch(r"[0-9a-f]{7,64}\+?", revision) else None,
-    )
+    return {
+        "checkpoint": found.name,
+        "samples": samples if type(samples) is int else None,
+        "returns": _returns(evaluation),
+        "versions": ", ".join(f"{name} {version}" for name, version in known if version),
+        "git_revision": revision if re.fullmatch(r"[0-9a-f]{7,64}\+?", revision) else None,
+    }
 
 
 def _sweep_row(policy: Path, seed: int) -> dict[str, Any]:

@@ -269,10 +269,8 @@ def test_video_of_two_runs_side_by_side(trained, tmp_path, opengl):
     assert length(out / "v.gif") == pytest.approx(19 * 80, abs=80)
 
 
-def test_video_of_all_checkpoints_and_of_a_policy_file(trained, tmp_path, opengl):
+def test_video_of_all_checkpoints(trained, tmp_path, opengl):
     run_dir = shutil.copytree(trained, tmp_path / "run")
     assert len(list((run_dir / "checkpoints").iterdir())) == 2
     render(run_dir, "--during", "--format", "gif")
     assert length(run_dir / "video-during.gif") == pytest.approx(19 * 80, abs=80)
-    render(make_untrained("quantile", tmp_path).file, "--format", "gif")
-    assert length(tmp_path / "quantile-video.gif") > 0
