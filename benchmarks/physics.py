@@ -112,7 +112,7 @@ def engine_speed(name: str, engine: str, worlds: int, arguments: Arguments) -> t
             return devices.divided(some, (0, None, None), 0)(state, key, count)
 
     qpos = jnp.broadcast_to(jnp.asarray(physics.model.qpos0), (worlds, physics.model.nq))
-    state = physics.at_pose(qpos, jnp.zeros((worlds, physics.model.nv)))
+    state = physics.init(qpos, jnp.zeros((worlds, physics.model.nv)))
     since = arguments.clock()
     compiled = run.lower(state, jax.random.key(0), 1).compile()
     compiling = arguments.clock() - since

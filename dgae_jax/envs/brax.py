@@ -18,7 +18,7 @@ from jaxtyping import Array, Float
 
 from dgae_jax.envs.base import Env, Wrapper, brax
 from dgae_jax.envs.registry import BRAX, TASKS, make_env
-from dgae_jax.physics.quiet import silenced
+from dgae_jax.physics.native import silence_warnings
 
 
 class BraxTask(Wrapper):
@@ -33,7 +33,7 @@ class BraxTask(Wrapper):
 def make(name: str, physics: str, version: None, **parameters) -> Env:
     """The environment that Brax calls `name`, on Brax's MJX backend; raises ValueError where Brax cannot build it."""
     try:
-        with warnings.catch_warnings(), silenced():
+        with warnings.catch_warnings(), silence_warnings():
             warnings.simplefilter(
                 "ignore"
             )  # Brax speaks of features of its model files that it leaves out

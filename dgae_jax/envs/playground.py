@@ -11,7 +11,7 @@ from brax.envs.wrappers.training import EpisodeWrapper
 from jaxtyping import Array, Float
 
 from dgae_jax.envs.base import Env, State
-from dgae_jax.physics.quiet import silenced
+from dgae_jax.physics.native import silence_warnings
 from dgae_jax.physics.registry import require
 
 IMPL = {"mjx": "jax", "mjx-warp": "warp"}
@@ -85,7 +85,7 @@ def make(name: str, physics: str, version: None, **parameters) -> Env:
     Raises ValueError, with the reason, for a task that does not exist, whose robot's files are not there, or that is not for us.
     """
     require(physics)
-    with warnings.catch_warnings(), silenced():
+    with warnings.catch_warnings(), silence_warnings():
         warnings.simplefilter("ignore")
         from mujoco_playground import dm_control_suite, registry  # pyright: ignore[reportMissingImports]
         from mujoco_playground._src.mjx_env import MENAGERIE_PATH  # pyright: ignore[reportMissingImports]

@@ -114,7 +114,7 @@ class Task(Env):
         """Length of the observation."""
         nq, nv = self._physics.model.nq, self._physics.model.nv
         return jax.eval_shape(
-            lambda: self._observation(self._physics.at_pose(jnp.zeros(nq), jnp.zeros(nv)))
+            lambda: self._observation(self._physics.init(jnp.zeros(nq), jnp.zeros(nv)))
         ).shape[0]
 
     @property
@@ -137,12 +137,12 @@ class Task(Env):
         """A fresh random pose: noise of `reset_noise_scale` on positions and velocities."""
         q_key, v_key = jax.random.split(rng)
         qpos = self._init_qpos + self._uniform(q_key, self._physics.model.nq)
-        return self._at(self._physics.at_pose(qpos, self._velocity_noise(v_key)))
+        return self._at(self._physics.init(qpos, self._velocity_noise(v_key)))
 
     def set_state(self, state: State, qpos: ArrayLike, qvel: ArrayLike) -> State:
         """`state` moved to a pose, qpos [Q] and qvel [V], as Gymnasium's `set_state`; the solver starts cold."""
         return self._at(
-            self._physics.at_pose(
+            self._physics.init(
                 jnp.asarray(qpos, state.obs.dtype), jnp.asarray(qvel, state.obs.dtype)
             )
         )

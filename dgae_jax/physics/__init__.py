@@ -1,1 +1,1 @@
-"""Physics engines behind one contract: see `engine`."""
+"""Physics engines behind one contract; see `engine`."""

@@ -1,12 +1,12 @@
-"""What a task asks of a physics engine: advance a small state by one control interval.
+"""The contract of a physics engine: advance a small state by one control interval.
 
-A task says what it looks at (`Reads`) and an engine returns it in a `PhysicsState`. Engines are functions
-`(spec, frame_skip, reads) -> Physics`; `registry` names them.
+A task declares what it reads (`Reads`), and an engine returns it in a `PhysicsState`. Engines are
+functions of type `EngineBuilder`; `registry` names them.
 """
 
-from collections.abc import Callable
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
+import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
@@ -14,19 +14,19 @@ from jaxtyping import Array, Float
 
 
 class Reads(NamedTuple):
-    """What a task looks at besides positions and velocities."""
+    """The quantities that a task reads besides positions and velocities."""
 
     bodies: tuple[str, ...] = ()
-    """Names of bodies whose position it reads; each must float freely (`body_ids`)."""
+    """Names of bodies for `xpos`; each must have a free joint (`body_ids`)."""
     forces: bool = False
-    """Whether it reads the external forces on the bodies."""
+    """True if the task reads `cfrc_ext`."""
 
 
 class PhysicsState(NamedTuple):
-    """All that MuJoCo needs to continue exactly: a few hundred bytes per world instead of a whole `mjData`.
+    """All that MuJoCo needs to continue exactly: a few hundred bytes per env, not a whole `mjData`.
 
-    The fields are those of `mjData`, by its names. `xpos` and `cfrc_ext` are what Gymnasium reads after `mj_step`, which leaves
-    them one substep behind: MuJoCo last computed them in the fourth stage of its last RK4 step.
+    The fields are those of `mjData`. `xpos` and `cfrc_ext` are what Gymnasium reads after
+    `mj_step`, one substep behind: MuJoCo computes them last in the fourth stage of RK4.
     """
 
     qpos: Float[Array, "*batch Q"]
@@ -38,54 +38,101 @@ class PhysicsState(NamedTuple):
     xpos: Float[Array, "*batch B 3"]
     """Positions of the bodies in `Reads.bodies` [m]."""
     cfrc_ext: Float[Array, "*batch E 6"]
-    """External torque and force on each body of the model [Nm, N]; E = 0 unless `Reads.forces`."""
+    """External torque and force on each body [Nm, N]; E = 0 unless `Reads.forces`."""
+
+
+class StepFn(Protocol):
+    """Advance a state by one control interval; pure, may be jitted and vmapped."""
+
+    def __call__(self, state: PhysicsState, ctrl: Array, /) -> PhysicsState:
+        """Return the state after `frame_skip` substeps under the constant control `ctrl` [U]."""
+        ...
 
 
 class Physics(NamedTuple):
-    """A model and how to advance it; `step` is pure and may be jitted and vmapped."""
+    """A model and the function that advances it."""
 
     model: mujoco.MjModel
-    step: Callable[[PhysicsState, Array], PhysicsState]
-    """`step(state, ctrl [U]) -> state` after `frame_skip` substeps under a constant control."""
+    step: StepFn
     name: str
-    """The engine's, as in `registry.ENGINES`."""
+    """Key of `registry.ENGINES`."""
     reads: Reads
 
-    def at_pose(
-        self, qpos: Float[Array, "*batch Q"], qvel: Float[Array, "*batch V"]
-    ) -> PhysicsState:
-        """The state at a pose, with the cold warm start of a fresh `mjData`: a reset costs no forward pass."""
-        model, lead = self.model, qpos.shape[:-1]
+    def init(self, qpos: Float[Array, "*batch Q"], qvel: Float[Array, "*batch V"]) -> PhysicsState:
+        """Return the state at a pose, with the cold warm start of a fresh `mjData`.
+
+        No forward pass: bodies that a task reads float freely, so `xpos` is a part of `qpos`.
+        """
+        model, batch = self.model, qpos.shape[:-1]
         addresses = model.jnt_qposadr[model.body_jntadr[body_ids(model, self.reads)]]
         xpos = qpos[..., addresses[:, None] + np.arange(3)]
-        forces = jnp.zeros((*lead, model.nbody if self.reads.forces else 0, 6), qpos.dtype)
+        forces = jnp.zeros((*batch, model.nbody if self.reads.forces else 0, 6), qpos.dtype)
         return PhysicsState(qpos, qvel, jnp.zeros_like(qvel), xpos, forces)
 
 
-def body_ids(model: mujoco.MjModel, reads: Reads) -> np.ndarray:
-    """Numbers of the bodies that a task reads.
+class EngineBuilder(Protocol):
+    """Compile a model for an engine; raises ValueError for a model that it does not cover."""
 
-    Raises ValueError for a body that is not in the model, or does not float freely: its position would not be a part of
-    `qpos`, and a reset computes no kinematics.
+    def __call__(self, spec: mujoco.MjSpec, frame_skip: int, reads: Reads, /) -> Physics:
+        """Return the physics of `spec`, advancing `frame_skip` substeps per control interval."""
+        ...
+
+
+def body_ids(model: mujoco.MjModel, reads: Reads) -> np.ndarray:
+    """Return the ids of the bodies that a task reads.
+
+    Raises:
+        ValueError: if a body is not in the model or has no free joint.
     """
     ids = [mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, name) for name in reads.bodies]
-    for number, name in zip(ids, reads.bodies, strict=True):
-        if number < 0:
+    for body, name in zip(ids, reads.bodies, strict=True):
+        if body < 0:
             raise ValueError(f"the model has no body {name!r}")
-        joint = model.body_jntadr[number]
+        joint = model.body_jntadr[body]
         if joint < 0 or model.jnt_type[joint] != mujoco.mjtJoint.mjJNT_FREE:
             raise ValueError(f"the position of body {name!r} cannot be read: it has no free joint")
     return np.array(ids, int)
 
 
 def refuse_hidden_state(model: mujoco.MjModel, name: str) -> None:
-    """Raise ValueError, naming it, for a model with a state that `PhysicsState` does not carry from step to step."""
+    """Raise ValueError for a model with a state that `PhysicsState` does not carry."""
     sizes = {
         "activations": "na",
         "histories": "nhistory",
         "plugin states": "npluginstate",
         "user data": "nuserdata",
     }
-    found = [what for what, size in sizes.items() if getattr(model, size, 0)]
+    found = [state for state, size in sizes.items() if getattr(model, size, 0)]
     if found:
         raise ValueError(f"physics {name} does not cover {', '.join(found)}, which the model has")
+
+
+def single_env(batched_step: StepFn) -> StepFn:
+    """Return the step of one env, given a step of a batch with the env axis last.
+
+    However the result is vmapped, nested too, all envs arrive in one call of `batched_step`.
+    """
+
+    @jax.custom_batching.custom_vmap
+    def many(state, ctrl):
+        return batched_step(state, ctrl)
+
+    @many.def_vmap
+    def _(size, batched, *args):
+        envs = args[1].shape[-1]
+
+        def merge(x, is_batched):
+            x = jnp.moveaxis(x, 0, -2) if is_batched else jnp.repeat(x[..., None, :], size, -2)
+            return x.reshape(*x.shape[:-2], size * envs)
+
+        out = many(*jax.tree.map(merge, args, tuple(batched)))
+        split = jax.tree.map(
+            lambda x: jnp.moveaxis(x.reshape(*x.shape[:-1], size, envs), -2, 0), out
+        )
+        return split, jax.tree.map(lambda _: True, out)
+
+    def step(state: PhysicsState, ctrl: Array) -> PhysicsState:
+        batch = jax.tree.map(lambda x: x[..., None], (state, ctrl))
+        return jax.tree.map(lambda x: x[..., 0], many(*batch))
+
+    return step

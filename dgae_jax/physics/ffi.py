@@ -1,114 +1,105 @@
-"""A Python function as a custom call of XLA: the CPU calls it by name, with views of its own buffers.
+"""Python functions as custom calls of XLA on the CPU, with views of its own buffers.
 
-`jax.pure_callback` writes the address of the function into the program, so that JAX cannot keep the program in its compilation cache,
-and takes every array through JAX. The structures are those of `xla/ffi/api/c_api.h`, whose versions XLA supports for a year at least.
+`jax.pure_callback` writes the address of the function into the program, so that JAX cannot keep
+the program in its compilation cache, and takes every array through JAX. The structures below are
+those of `xla/ffi/api/c_api.h`, whose versions XLA supports for at least a year.
 """
 
 import ctypes
 import functools
 import math
 from collections.abc import Callable, Sequence
+from ctypes import CFUNCTYPE, POINTER, c_char, c_char_p, c_int, c_int64, c_size_t, c_void_p
 
 import jax
 import numpy as np
 
 _MAJOR, _MINOR = 0, 1  # of the interface; JAX 0.10 and 0.12 accept it
 _DTYPES = {1: np.bool_, 4: np.int32, 8: np.uint32, 11: np.float32, 12: np.float64}
-_INTERNAL = 13
-"""XLA's error code of a defect in the called function."""
+_INTERNAL = 13  # XLA's error code of a defect in the called function
 
 Function = Callable[[Sequence[np.ndarray], Sequence[np.ndarray]], None]
 """Reads the arrays of its first argument and fills those of its second."""
 
 
 class _Struct(ctypes.Structure):
-    """What nearly all of them begin with; the names below are those of the header."""
+    """Common header of the structures; names of fields are those of the C header."""
 
-    _fields_ = (("struct_size", ctypes.c_size_t), ("extension", ctypes.c_void_p))
+    _fields_ = (("struct_size", c_size_t), ("extension", c_void_p))
 
 
 class _Buffer(_Struct):
-    _fields_ = (
-        ("dtype", ctypes.c_int),
-        ("data", ctypes.c_void_p),
-        ("rank", ctypes.c_int64),
-        ("dims", ctypes.POINTER(ctypes.c_int64)),
-    )
+    _fields_ = (("dtype", c_int), ("data", c_void_p), ("rank", c_int64), ("dims", POINTER(c_int64)))
 
 
 class _Buffers(_Struct):
-    _fields_ = (
-        ("size", ctypes.c_int64),
-        ("types", ctypes.c_void_p),
-        ("buffers", ctypes.POINTER(ctypes.POINTER(_Buffer))),
-    )
+    _fields_ = (("size", c_int64), ("types", c_void_p), ("buffers", POINTER(POINTER(_Buffer))))
 
 
 class _Version(_Struct):
-    _fields_ = (("major", ctypes.c_int), ("minor", ctypes.c_int))
+    _fields_ = (("major", c_int), ("minor", c_int))
 
 
 class _Metadata(ctypes.Structure):
-    _fields_ = (
-        ("struct_size", ctypes.c_size_t),
-        ("version", _Version),
-        ("traits", ctypes.c_uint32),
-    )
+    _fields_ = (("struct_size", c_size_t), ("version", _Version), ("traits", ctypes.c_uint32))
 
 
 class _MetadataRequest(ctypes.Structure):
     _fields_ = (
-        ("struct_size", ctypes.c_size_t),
-        ("type", ctypes.c_int),
-        ("next", ctypes.c_void_p),
-        ("metadata", ctypes.POINTER(_Metadata)),
+        ("struct_size", c_size_t),
+        ("type", c_int),
+        ("next", c_void_p),
+        ("metadata", POINTER(_Metadata)),
     )
 
 
 class _ErrorArguments(_Struct):
-    _fields_ = (("message", ctypes.c_char_p), ("code", ctypes.c_int))
+    _fields_ = (("message", c_char_p), ("code", c_int))
 
 
 class _Api(_Struct):
     _fields_ = (
         ("version", _Version),
-        ("internal", ctypes.c_void_p),
-        ("error_create", ctypes.CFUNCTYPE(ctypes.c_void_p, ctypes.POINTER(_ErrorArguments))),
+        ("internal", c_void_p),
+        ("error_create", CFUNCTYPE(c_void_p, POINTER(_ErrorArguments))),
     )
 
 
 class _CallFrame(_Struct):
     _fields_ = (
-        ("api", ctypes.POINTER(_Api)),
-        ("context", ctypes.c_void_p),
-        ("stage", ctypes.c_int),
+        ("api", POINTER(_Api)),
+        ("context", c_void_p),
+        ("stage", c_int),
         ("arguments", _Buffers),
         ("results", _Buffers),
     )
 
 
-_Handler = ctypes.CFUNCTYPE(ctypes.c_void_p, ctypes.POINTER(_CallFrame))
-_registered: dict[str, object] = {}  # what XLA has a pointer to must stay
+_Handler = CFUNCTYPE(c_void_p, POINTER(_CallFrame))
+_registered: dict[str, object] = {}  # XLA holds pointers to these
 
 
 def register(name: str, function: Function) -> None:
-    """Let programs on the CPU call `function` by a name, which must stand for the same function in every process.
+    """Let programs on the CPU call `function` by a name.
 
-    An exception in it ends the program with `jax.errors.JaxRuntimeError`. A name that is registered already is left as it is.
+    An exception in it ends the program with `jax.errors.JaxRuntimeError`.
+
+    Args:
+        name: target for `jax.ffi.ffi_call`. It must stand for the same function in every process;
+            a name that is registered already is left as it is.
+        function: reads and fills arrays.
     """
     if name not in _registered:
         _registered[name] = handler = _Handler(functools.partial(_handle, function))
-        jax.ffi.register_ffi_target(
-            name, jax.ffi.pycapsule(ctypes.cast(handler, ctypes.c_void_p)), platform="cpu"
-        )
+        capsule = jax.ffi.pycapsule(ctypes.cast(handler, c_void_p))
+        jax.ffi.register_ffi_target(name, capsule, platform="cpu")
 
 
 def _handle(function: Function, pointer) -> int | None:
     frame = pointer.contents
-    if frame.extension:  # XLA asks for the version and no more
-        metadata = ctypes.cast(
-            frame.extension, ctypes.POINTER(_MetadataRequest)
-        ).contents.metadata.contents
+    if frame.extension:  # XLA only asks for the version
+        request = ctypes.cast(frame.extension, POINTER(_MetadataRequest))
+        metadata = request.contents.metadata.contents
         metadata.version.major, metadata.version.minor, metadata.traits = _MAJOR, _MINOR, 0
         return None
     try:
@@ -125,12 +116,9 @@ def _arrays(buffers: _Buffers) -> list[np.ndarray]:
     return [_view(buffer.data, buffer.dtype, tuple(buffer.dims[: buffer.rank])) for buffer in each]
 
 
-@functools.lru_cache(
-    1024
-)  # a loop calls with the same buffers again and again; a view lives only through one call
+@functools.lru_cache(1024)  # a loop calls with the same buffers; a view lives through one call only
 def _view(address: int | None, dtype: int, shape: tuple[int, ...]) -> np.ndarray:
     number = np.dtype(_DTYPES[dtype])
-    memory = (ctypes.c_char * (math.prod(shape) * number.itemsize)).from_address(
-        address or 0
-    )  # no elements, no address
+    size = math.prod(shape) * number.itemsize
+    memory = (c_char * size).from_address(address or 0)  # an empty array has no address
     return np.ndarray(shape, number, memory)  # pyright: ignore[reportArgumentType, reportCallIssue]

@@ -1,11 +1,14 @@
-"""C MuJoCo inside a jitted program: `mujoco.batch` behind a custom call, bit for bit what `mj_step` computes.
+"""C MuJoCo inside a jitted program: `mujoco.batch` in a custom call, bit for bit `mj_step`.
 
-It compiles in seconds, runs on CPU threads, and is the referee for the other engines.
+It compiles in seconds, runs on CPU threads, and is the reference for the other engines.
 """
 
 import contextlib
 import hashlib
+import logging
 import math
+import threading
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from functools import partial
 
@@ -15,52 +18,85 @@ import numpy as np
 from jaxtyping import Array
 from mujoco.batch import Batch
 
-from dgae_jax.physics import ffi, quiet
-from dgae_jax.physics.cores import cores
+from dgae_jax.physics import ffi
 from dgae_jax.physics.engine import Physics, PhysicsState, Reads, body_ids, refuse_hidden_state
+from dgae_jax.physics.registry import cores
 
-_FIELDS = ("qpos", "qvel", "qacc_warmstart")
+_LOG = logging.getLogger(__name__)
+_INPUTS = ("qpos", "qvel", "qacc_warmstart")
+
+WARNING_COUNTS: Counter[str] = Counter()
+"""Warnings of C MuJoCo in this process while `native` stepped, by MuJoCo's name."""
+_WARNINGS = [
+    mujoco.mjtWarning(i).name.removeprefix("mjWARN_")
+    for i in range(int(mujoco.mjtWarning.mjNWARNING))
+]
+_lock, _callers, _handler = threading.Lock(), 0, None
+"""Callers inside `silence_warnings`, and the handler to restore after the last one."""
 
 
-class _Host:
-    """Keeps simulations per batch size, and takes others where those are in use: CPU devices of JAX call side by side."""
+@contextlib.contextmanager
+def silence_warnings() -> Iterator[None]:
+    """Keep MuJoCo's warnings, from any thread, off stderr and out of MUJOCO_LOG.TXT."""
+    global _callers, _handler
+    with _lock:
+        if not _callers:
+            _handler = mujoco.get_mju_user_warning()
+            mujoco.set_mju_user_warning(lambda message: None)
+        _callers += 1
+    try:
+        yield
+    finally:
+        with _lock:
+            _callers -= 1
+            if not _callers:
+                mujoco.set_mju_user_warning(_handler)
+
+
+def _count_warnings(new: np.ndarray) -> None:
+    """Add new warnings, one number per kind; only the first of each kind is logged."""
+    for kind, number in zip(_WARNINGS, new.tolist(), strict=True):
+        if number and kind not in WARNING_COUNTS:
+            _LOG.warning(
+                "MuJoCo warns of %s in physics native; more of this kind are counted, not shown",
+                kind,
+            )
+        if number:
+            WARNING_COUNTS[kind] += number
+
+
+class _Simulations:
+    """Batches of simulations by their size; JAX's CPU devices call concurrently."""
 
     def __init__(self, model: mujoco.MjModel, frame_skip: int, reads: Reads):
-        self.model, self.frame_skip, self.reads, self.bodies = (
-            model,
-            frame_skip,
-            reads,
-            body_ids(model, reads),
-        )
+        self.model, self.frame_skip, self.reads = model, frame_skip, reads
+        self.bodies = body_ids(model, reads)
         self.free: dict[int, list[Batch]] = {}
 
     def step(self, before: Sequence[np.ndarray], after: Sequence[np.ndarray]) -> None:
-        """Fill the fields of a `PhysicsState` after a step, from those in `_FIELDS` and the control before it."""
+        """Fill the fields of a `PhysicsState` from `_INPUTS` and the control before the step."""
         count = math.prod(before[0].shape[:-1])
-        with self._batch(count) as batch, quiet.silenced():
-            for name, array in zip((*_FIELDS, "ctrl"), before, strict=True):
+        with self._batch(count) as batch, silence_warnings():
+            for name, array in zip((*_INPUTS, "ctrl"), before, strict=True):
                 batch.bind(name)[:] = array.reshape(count, -1)
             warned = _warnings(batch)
             batch.step(nstep=self.frame_skip)
-            quiet.count(_warnings(batch) - warned)
+            _count_warnings(_warnings(batch) - warned)
             forces = self._forces(batch) if self.reads.forces else np.empty((count, 0, 6))
-            for array, value in zip(
-                after,
-                (*map(batch.bind, _FIELDS), batch.bind("xpos")[:, self.bodies], forces),
-                strict=True,
-            ):
+            values = (*map(batch.bind, _INPUTS), batch.bind("xpos")[:, self.bodies], forces)
+            for array, value in zip(after, values, strict=True):
                 array[:] = value.reshape(array.shape)
 
-    def returned(self, like: Sequence[jax.ShapeDtypeStruct], *before) -> tuple[np.ndarray, ...]:
-        """The same for `jax.pure_callback`: `like` is the `PhysicsState` of one of the worlds."""
-        lead = before[0].shape[: before[0].ndim - len(like[0].shape)]
-        after = tuple(np.empty((*lead, *x.shape), x.dtype) for x in like)
+    def callback(self, like: Sequence[jax.ShapeDtypeStruct], *before) -> tuple[np.ndarray, ...]:
+        """Step under `jax.pure_callback`; `like` is the `PhysicsState` of one env."""
+        batch = before[0].shape[: before[0].ndim - len(like[0].shape)]
+        after = tuple(np.empty((*batch, *x.shape), x.dtype) for x in like)
         self.step([np.asarray(x) for x in before], after)
         return after
 
     @contextlib.contextmanager
     def _batch(self, count: int) -> Iterator[Batch]:
-        """Simulations that nobody else uses meanwhile; what was written to them before does not count."""
+        """Lend simulations that no other thread uses; their previous state does not matter."""
         free = self.free.setdefault(count, [])
         try:
             batch = free.pop()
@@ -73,7 +109,7 @@ class _Host:
         free.append(batch)
 
     def _forces(self, batch: Batch) -> np.ndarray:
-        """`mj_rnePostConstraint` after each step, as Gymnasium does."""
+        """Call `mj_rnePostConstraint` after each step, as Gymnasium does."""
         forces, data = np.empty((batch.nsim, self.model.nbody, 6)), mujoco.MjData(self.model)
         for i in range(batch.nsim):
             batch.get_data(i, data)
@@ -83,41 +119,41 @@ class _Host:
 
 
 def _warnings(batch: Batch) -> np.ndarray:
-    """How often each kind of warning was raised so far, over all simulations."""
+    """Return the warnings so far, by kind, summed over the simulations."""
     return batch.warning[..., 1].sum(0)
 
 
 def native(spec: mujoco.MjSpec, frame_skip: int, reads: Reads) -> Physics:
-    """C MuJoCo advancing every world of a batch on all cores of this process.
+    """Build C MuJoCo, advancing all envs of a batch on all cores of this process.
 
-    A state that turns non-finite stays so and can be seen: C's own silent reset of such states is switched off. Raises
-    ValueError for a model with a state beyond positions and velocities.
+    A non-finite state stays visible: C's own silent reset of such states is switched off.
+
+    Raises:
+        ValueError: if the model has a state beyond positions and velocities.
     """
     model = spec.compile()
     refuse_hidden_state(model, "native")
     model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
-    host = _Host(model, frame_skip, reads)
-    name = f"dgae_jax_native_{_digest(model, frame_skip, reads)}"
-    ffi.register(name, host.step)
+    simulations = _Simulations(model, frame_skip, reads)
+    target = f"dgae_jax_native_{_digest(model, frame_skip, reads)}"
+    ffi.register(target, simulations.step)
 
     def step(state: PhysicsState, ctrl: Array) -> PhysicsState:
         like = tuple(jax.ShapeDtypeStruct(x.shape, x.dtype) for x in state)
-        on_cpu = jax.ffi.ffi_call(name, like, vmap_method="broadcast_all")
+        on_cpu = jax.ffi.ffi_call(target, like, vmap_method="broadcast_all")
 
-        def elsewhere(*before):  # JAX's device is not the CPU
-            return jax.pure_callback(
-                partial(host.returned, like), like, *before, vmap_method="broadcast_all"
-            )
+        def elsewhere(*before):
+            function = partial(simulations.callback, like)
+            return jax.pure_callback(function, like, *before, vmap_method="broadcast_all")
 
-        return PhysicsState(
-            *jax.lax.platform_dependent(*state[:3], ctrl, cpu=on_cpu, default=elsewhere)
-        )
+        after = jax.lax.platform_dependent(*state[:3], ctrl, cpu=on_cpu, default=elsewhere)
+        return PhysicsState(*after)
 
     return Physics(model, step, "native", reads)
 
 
 def _digest(model: mujoco.MjModel, frame_skip: int, reads: Reads) -> str:
-    """The same in every process: programs that are kept find their step by it."""
+    """Return the same name in every process: cached programs find their step by it."""
     binary = np.zeros(mujoco.mj_sizeModel(model), np.uint8)
     mujoco.mj_saveModel(model, None, binary)
     return hashlib.sha256(binary.tobytes() + repr((frame_skip, reads)).encode()).hexdigest()[:32]

@@ -1,24 +1,50 @@
-"""The engines by name. Importing this loads no engine, so that names can be checked before JAX or MuJoCo are imported."""
+"""The engines by name.
 
+Importing this loads no engine: names are checked before JAX or MuJoCo are imported.
+"""
+
+import os
 from importlib.util import find_spec
-from pkgutil import resolve_name
 from typing import TYPE_CHECKING, NamedTuple
 
 if TYPE_CHECKING:
     import mujoco
 
-    from dgae_jax.physics.engine import Physics, Reads
+    from dgae_jax.physics.engine import EngineBuilder, Physics, Reads
+
+
+def _jax(spec: "mujoco.MjSpec", frame_skip: int, reads: "Reads") -> "Physics":
+    from dgae_jax.physics.jax.forward import jax_engine
+
+    return jax_engine(spec, frame_skip, reads)
+
+
+def _mjx(spec: "mujoco.MjSpec", frame_skip: int, reads: "Reads") -> "Physics":
+    from dgae_jax.physics.mjx import mjx
+
+    return mjx(spec, frame_skip, reads)
+
+
+def _mjx_warp(spec: "mujoco.MjSpec", frame_skip: int, reads: "Reads") -> "Physics":
+    from dgae_jax.physics.mjx import mjx_warp
+
+    return mjx_warp(spec, frame_skip, reads)
+
+
+def _native(spec: "mujoco.MjSpec", frame_skip: int, reads: "Reads") -> "Physics":
+    from dgae_jax.physics.native import native
+
+    return native(spec, frame_skip, reads)
 
 
 class Engine(NamedTuple):
-    """Where an engine is built, and what it needs."""
+    """An engine and its requirements."""
 
-    builder: str
-    """`module:function` of (spec, frame_skip, reads), which returns a `Physics`."""
+    build: "EngineBuilder"
     about: str
-    """What it is and where it serves, for help texts."""
+    """One line for help texts."""
     on_host: bool = False
-    """Whether it simulates on the CPU whatever JAX's device is."""
+    """True if it simulates on the CPU whatever JAX's device is."""
     package: str | None = None
     """Module that must be installed beside the dependencies."""
     extra: str | None = None
@@ -26,37 +52,47 @@ class Engine(NamedTuple):
 
 
 ENGINES = {
-    "jax": Engine(
-        "dgae_jax.physics.jax.engine:jax_engine", "MuJoCo's stages in our own JAX code, CPU or GPU"
-    ),
-    "mjx": Engine(
-        "dgae_jax.physics.mjx:mjx", "google-deepmind's MuJoCo MJX, unchanged, any device"
-    ),
+    "jax": Engine(_jax, "MuJoCo's stages in our own JAX code, CPU or GPU"),
+    "mjx": Engine(_mjx, "google-deepmind's MuJoCo MJX, unchanged, any device"),
     "mjx-warp": Engine(
-        "dgae_jax.physics.mjx:mjx_warp",
-        "MuJoCo MJX over MuJoCo Warp, NVIDIA GPUs",
-        package="warp",
-        extra="warp",
+        _mjx_warp, "MuJoCo MJX over MuJoCo Warp, NVIDIA GPUs", package="warp", extra="warp"
     ),
-    "native": Engine("dgae_jax.physics.native:native", "C MuJoCo, CPU", on_host=True),
+    "native": Engine(_native, "C MuJoCo, CPU", on_host=True),
 }
 
 
 def require(name: str) -> None:
-    """Raise ValueError, naming what exists or how to install it, for an engine that cannot be used."""
+    """Check that an engine can be used.
+
+    Raises:
+        ValueError: if `name` is unknown or its package is not installed.
+    """
     if name not in ENGINES:
         raise ValueError(f"unknown physics {name!r}: must be one of {', '.join(ENGINES)}")
     package, extra = ENGINES[name].package, ENGINES[name].extra
     if package is not None and find_spec(package) is None:
         raise ValueError(
-            f'physics {name} needs the package {package}, which is not installed: pip install "dgae_jax[{extra}]"'
+            f"physics {name} needs the package {package}, which is not installed:"
+            f' pip install "dgae_jax[{extra}]"'
         )
 
 
 def make_physics(name: str, spec: "mujoco.MjSpec", frame_skip: int, reads: "Reads") -> "Physics":
-    """The engine `name` over a model, advancing `frame_skip` substeps at a time and returning what `reads` names.
+    """Build the engine `name` over a model.
 
-    Raises ValueError, naming the reason, for an unknown or missing engine and for a model that it does not cover.
+    Args:
+        name: key of `ENGINES`.
+        spec: the model.
+        frame_skip: substeps per control interval.
+        reads: the quantities that the task reads besides positions and velocities.
+
+    Raises:
+        ValueError: if the engine is unknown, not installed, or does not cover the model.
     """
     require(name)
-    return resolve_name(ENGINES[name].builder)(spec, frame_skip, reads)
+    return ENGINES[name].build(spec, frame_skip, reads)
+
+
+def cores() -> int:
+    """Return the number of cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
