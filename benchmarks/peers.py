@@ -9,7 +9,7 @@ from typing import Any
 import gymnasium
 
 from dgae_jax.envs.registry import TASKS
-from dgae_jax.physics.cores import cores
+from dgae_jax.physics.registry import cores
 
 
 @dataclass(frozen=True)
@@ -71,7 +71,7 @@ def steps_per_second(
         gymnasium.logger.min_level = (
             gymnasium.logger.ERROR
         )  # that v4 is not the latest version is known
-        return gymnasium.make(TASKS[task].referees["v4"])
+        return gymnasium.make(TASKS[task].eval_envs["v4"])
 
     env = VecNormalize(
         make_vec_env(world, worlds, vec_env_cls=SubprocVecEnv if processes else DummyVecEnv)

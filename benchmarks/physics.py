@@ -80,7 +80,7 @@ def steps_per_second(run: Callable[[int], Any], worlds: int, arguments: Argument
 def c_speed(name: str, worlds: int, arguments: Arguments) -> float:
     """C MuJoCo on one thread, under new random controls at every step."""
     env: Any = dg.make_env(name, physics="native")
-    model, rng = env._physics.model, np.random.default_rng(0)
+    model, rng = env.physics.model, np.random.default_rng(0)
     batch = Batch(model, worlds, 1)
     batch.bind("qpos")[:] = model.qpos0
 
@@ -95,7 +95,7 @@ def c_speed(name: str, worlds: int, arguments: Arguments) -> float:
 def engine_speed(name: str, engine: str, worlds: int, arguments: Arguments) -> tuple[float, float]:
     """Environment steps per second of an engine, and seconds to compile."""
     env: Any = dg.make_env(name, physics=engine)
-    physics = env._physics
+    physics = env.physics
 
     def some(state, key, count):
         def one(i, state):
@@ -139,7 +139,7 @@ def speeds(arguments: Arguments) -> None:
 def gymnasium_task(name: str):
     """Gymnasium's v4 task."""
     gymnasium.logger.min_level = gymnasium.logger.ERROR
-    return gymnasium.make(TASKS[name].referees["v4"]).unwrapped
+    return gymnasium.make(TASKS[name].eval_envs["v4"]).unwrapped
 
 
 def visited(

@@ -17,7 +17,7 @@ from throughput import iteration, setting
 
 from dgae_jax.cli.arguments import parse
 from dgae_jax.configs.config import Config
-from dgae_jax.physics.cores import cores
+from dgae_jax.physics.registry import cores
 from dgae_jax.run import runtime
 
 

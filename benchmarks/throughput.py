@@ -39,7 +39,7 @@ from dgae_jax.learn.build import make_policy, make_task, make_trainer, seed_keys
 from dgae_jax.learn.iteration import _estimate, _roll_out, acting, nothing
 from dgae_jax.learn.parallel import COMPILER_OPTIONS
 from dgae_jax.learn.types import InferenceState
-from dgae_jax.physics.cores import cores
+from dgae_jax.physics.registry import cores
 from dgae_jax.run import runtime
 from dgae_jax.run.options import RunOptions
 
@@ -226,7 +226,7 @@ def _without_physics(config: Config) -> list[tuple[Callable, tuple]]:
 def c_seconds(task: str, worlds: int, num_steps: int) -> float:
     """C MuJoCo alone, on all cores, under random controls [s]."""
     env: Any = dg.make_env(task, physics="native")
-    model, rng = env._physics.model, np.random.default_rng(0)
+    model, rng = env.physics.model, np.random.default_rng(0)
     batch = Batch(model, worlds, min(cores(), worlds))
     batch.bind("qpos")[:] = model.qpos0
 

@@ -11,10 +11,7 @@ import jax
 import jax.numpy as jnp
 
 import dgae_jax as dg
-from dgae_jax.envs.gym_tasks import Ant, Hopper, Swimmer, Walker2d
 from dgae_jax.run import checkpoint
-
-GYM_TASKS = {"ant": Ant, "hopper": Hopper, "swimmer": Swimmer, "walker2d": Walker2d}
 
 ROOT = Path(__file__).parent.parent
 

@@ -1,4 +1,4 @@
-"""States of the four models, what C MuJoCo makes of them, and the engines' answers: for the tests of engines."""
+"""States of the four models, and the steps of C MuJoCo and of the engines from them."""
 
 import functools
 from importlib.util import find_spec
@@ -9,10 +9,10 @@ import mujoco
 import numpy as np
 import pytest
 
+from dgae_jax.envs.gym_tasks import GYM_TASKS
 from dgae_jax.envs.task import load_spec
 from dgae_jax.physics.engine import PhysicsState, Reads
 from dgae_jax.physics.registry import make_physics
-from tests.helpers import GYM_TASKS
 
 COUNT = 128
 
@@ -22,8 +22,16 @@ WARP = pytest.mark.skipif(
 UPSTREAM = pytest.mark.xfail(
     strict=True,
     raises=AssertionError,
-    reason="MJX takes another contact tangent than C (google-deepmind/mujoco#2774) and has no RKMK correction of free joints in RK4",
+    reason="MJX has another contact tangent than C (google-deepmind/mujoco#2774) and no RKMK",
 )
+
+
+FEET = mujoco.MjSpec.from_string("""
+<mujoco><option integrator="RK4"/><worldbody><geom type="plane" size="9 9 1"/>
+<body pos="0 0 .2"><joint type="slide" axis="0 0 1"/><joint axis="0 1 0"/>
+<geom type="capsule" size=".1" fromto="-.3 0 0 .3 0 0"/></body></worldbody></mujoco>
+""")
+"""A capsule that falls on its two ends: quick to compile, with contacts."""
 
 
 def model_of(name):
@@ -36,7 +44,7 @@ def reads_of(name):
 
 @functools.cache
 def states(name):
-    """Poses under random and held controls from random starts, fallen ones included, in float32, with a control for each."""
+    """Poses under random and held controls, fallen ones included, in float32, with controls."""
     model, rng = model_of(name), np.random.default_rng(0)
     data, kept = mujoco.MjData(model), []
     while len(kept) < COUNT:
@@ -45,12 +53,10 @@ def states(name):
             data.qpos[:] += rng.uniform(-0.2, 0.2, model.nq)
             data.qvel[:] += rng.uniform(-1, 1, model.nv)
             held = rng.uniform(-1.2, 1.2, model.nu)
-        ctrl = (held if len(kept) % 64 < 32 else rng.uniform(-1.2, 1.2, model.nu)).astype(
-            np.float32
-        )
-        kept.append(
-            (*(x.astype(np.float32) for x in (data.qpos, data.qvel, data.qacc_warmstart)), ctrl)
-        )
+        ctrl = held if len(kept) % 64 < 32 else rng.uniform(-1.2, 1.2, model.nu)
+        ctrl = ctrl.astype(np.float32)
+        state = (data.qpos, data.qvel, data.qacc_warmstart)
+        kept.append((*(x.astype(np.float32) for x in state), ctrl))
         data.ctrl[:] = ctrl
         mujoco.mj_step(model, data, nstep=GYM_TASKS[name].FRAME_SKIP)
     return tuple(np.stack(x) for x in zip(*kept, strict=True))
@@ -58,40 +64,31 @@ def states(name):
 
 @functools.cache
 def reference(name):
-    """The same control interval by `mj_step` on a single `mjData`, read as Gymnasium reads it, and the number of contacts."""
+    """The control interval by `mj_step`, read as Gymnasium reads it, and the contacts."""
     model = model_of(name)
     data, after, contacts = mujoco.MjData(model), [], []
     for qpos, qvel, warmstart, ctrl in zip(*states(name), strict=True):
-        data.qpos[:], data.qvel[:], data.qacc_warmstart[:], data.ctrl[:] = (
-            qpos,
-            qvel,
-            warmstart,
-            ctrl,
-        )
+        data.qpos[:], data.qvel[:] = qpos, qvel
+        data.qacc_warmstart[:], data.ctrl[:] = warmstart, ctrl
         mujoco.mj_step(model, data, nstep=GYM_TASKS[name].FRAME_SKIP)
         mujoco.mj_rnePostConstraint(model, data)
         xpos = data.xpos[1:2] if name == "ant" else data.xpos[:0]
-        after.append(
-            [x.copy() for x in (data.qpos, data.qvel, data.qacc_warmstart, xpos, data.cfrc_ext)]
-        )
+        fields = (data.qpos, data.qvel, data.qacc_warmstart, xpos, data.cfrc_ext)
+        after.append([x.copy() for x in fields])
         contacts.append(data.ncon)
     return PhysicsState(*(np.stack(x) for x in zip(*after, strict=True))), np.array(contacts)
 
 
 @functools.cache
 def stepped(name, engine, *, x64=False):
-    """What an engine makes of the states."""
+    """The control interval by an engine."""
     with jax.enable_x64(x64):
-        physics = make_physics(
-            engine,
-            load_spec(GYM_TASKS[name].FILE["v4"]),
-            GYM_TASKS[name].FRAME_SKIP,
-            reads_of(name),
-        )
+        spec, skip = load_spec(GYM_TASKS[name].FILE["v4"]), GYM_TASKS[name].FRAME_SKIP
+        physics = make_physics(engine, spec, skip, reads_of(name))
         qpos, qvel, warmstart, ctrl = (
             jnp.asarray(x, float if x64 else jnp.float32) for x in states(name)
         )
-        state = physics.at_pose(qpos, qvel)._replace(qacc_warmstart=warmstart)
+        state = physics.init(qpos, qvel)._replace(qacc_warmstart=warmstart)
         return jax.tree.map(np.asarray, jax.jit(jax.vmap(physics.step))(state, ctrl))
 
 

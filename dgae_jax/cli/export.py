@@ -67,7 +67,7 @@ def _checked(arguments: Arguments) -> tuple[ResolvedConfig, Path]:
         onnx_model.check_installed()
     config = directory.config_of(arguments.run_dir)
     check_index(arguments.index, config, arguments.run_dir)
-    if "gymnasium" in arguments.to and spec_of(config.env).referee() is None:
+    if "gymnasium" in arguments.to and spec_of(config.env).eval_env() is None:
         raise invalid(
             "to", "gymnasium", f"left out with {config.env}, which Gymnasium does not play"
         )

@@ -31,7 +31,7 @@ def make(study: Sweep) -> list[Path]:
     for task in dict.fromkeys(row.task for row in study.rows):
         rows = [row for row in study.rows if row.task == task]
         stem = study.directory / "videos" / task.replace(":", "-")
-        if stem.with_name(f"{stem.name}.mp4").exists() or not spec_of(rows[0].env).referees:
+        if stem.with_name(f"{stem.name}.mp4").exists() or not spec_of(rows[0].env).eval_envs:
             continue
         chosen = typical(rows)
         run_dir = study.directory / "runs" / chosen.run

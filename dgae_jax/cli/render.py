@@ -125,7 +125,7 @@ def _check_out(arguments: Arguments) -> None:
 def _config(path: Path, index: int) -> ResolvedConfig:
     """The configuration of a run that Gymnasium can play."""
     config = directory.config_of(path)
-    if not spec_of(config.env).referees:
+    if not spec_of(config.env).eval_envs:
         raise ConfigError(
             f"{path}: must be a run of {', '.join(TASKS)}, which can be filmed; it is one of {config.env}"
         )

@@ -156,7 +156,7 @@ def _storage(url: str | None) -> str | None:
 
 def _workers(arguments: Arguments) -> int:
     """Processes on this machine."""
-    from dgae_jax.physics.native import cores
+    from dgae_jax.physics.registry import cores
 
     wanted, there = arguments.workers, cores()
     if wanted is None:

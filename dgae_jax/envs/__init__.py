@@ -1,1 +1,1 @@
-"""The tasks, as Brax environments: `task` is what they share, `gym_tasks` the four, `registry` their names."""
+"""The tasks, as Brax environments: `task` is what they share, `gym_tasks` the four of Gymnasium."""

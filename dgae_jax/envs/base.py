@@ -1,28 +1,37 @@
-"""Brax and its contract of an environment. They are imported from here, so that MJX, which Brax imports, is first imported by our
-engine of that name, where it cannot print that Warp is not installed.
+"""Brax's contract of an environment.
+
+Brax is imported from here, after our MJX engine: whoever imports MJX first sees it print that Warp
+is not installed, which the engine suppresses.
 """
 
 import dgae_jax.physics.mjx  # noqa: F401, I001
 import brax.envs
 import jax
 from brax.envs.base import Env, State, Wrapper
-from jaxtyping import Array
+from jaxtyping import Array, Float
 
-__all__ = ["Env", "State", "Wrapper", "brax", "has_limit", "restart"]
+__all__ = ["Env", "State", "ThirdPartyEnv", "Wrapper", "brax", "has_limit", "restart"]
+
+
+class ThirdPartyEnv(Env):
+    """An env whose sizes and range of actions are known when it is built."""
+
+    observation_size: int = 0  # pyright: ignore[reportIncompatibleMethodOverride, reportAssignmentType]
+    action_size: int = 0  # pyright: ignore[reportIncompatibleMethodOverride, reportAssignmentType]
+    backend: str = ""  # pyright: ignore[reportIncompatibleMethodOverride, reportAssignmentType]
+    action_range: tuple[Float[Array, " A"], Float[Array, " A"]]
 
 
 def restart(env: Env, state: State, rng: Array, done: Array) -> State:
-    """A fresh episode for a world that is in `state`, looked at only where that one is `done`.
+    """Return the start of an episode for an env in `state`; it is used only where `done`.
 
-    It is `env.reset(rng)`, computed in every world at every step, unless the class of `env` has a method
-    `restart(state, rng, done)` of its own, which may return anything of that shape for a world that is not done.
+    By default this is `env.reset(rng)`, computed in every env at every step. The class of `env` may
+    define a method `restart(state, rng, done)`, free to return anything where the env is not done.
     """
-    own = getattr(
-        type(env), "restart", None
-    )  # a wrapper passes on what its environment has, which is not its own
+    own = getattr(type(env), "restart", None)  # of the class: a wrapper passes on attributes
     return env.reset(rng) if own is None else own(env, state, rng, done)
 
 
 def has_limit(env: Env) -> bool:
-    """Whether the task may cut an episode short itself, which it says by `truncation` in `info`, as Brax has it."""
+    """Return True if the task marks truncations of its own, in `info["truncation"]`."""
     return "truncation" in jax.eval_shape(env.reset, jax.random.key(0)).info

@@ -1,4 +1,4 @@
-"""Randomness for tasks that have none: deterministic MuJoCo leaves a value distribution little to model."""
+"""Noise for deterministic tasks, so that there is a value distribution to model."""
 
 from collections.abc import Callable
 from typing import Any
@@ -11,10 +11,10 @@ from dgae_jax.envs.task import Task
 
 
 class Noisy(Wrapper):
-    """A task with normal noise of given standard deviations, drawn afresh at every step from the key of its reset.
+    """A task with normal noise of given standard deviations, drawn from the key of its reset.
 
-    The policy sees and the reward is paid with noise; the physics underneath stays exact. `initial` moves positions and
-    velocities at a reset, for our own tasks.
+    The policy sees noise and the reward is paid with it; the physics underneath stays exact.
+    `initial` is the noise on positions and velocities at a reset, for our own tasks.
     """
 
     def __init__(
@@ -29,24 +29,20 @@ class Noisy(Wrapper):
         super().__init__(env)
         if initial and not isinstance(env, Task):
             raise ValueError("noise on the initial state is for our own tasks")
-        self._reward, self._action, self._observation, self._initial = (
-            reward,
-            action,
-            observation,
-            initial,
-        )
+        self._reward, self._action = reward, action
+        self._observation, self._initial = observation, initial
 
     @property
     def action_range(self) -> tuple[Array, Array]:
-        """That of the task."""
+        """The range of the task's actions."""
         return self.env.action_range
 
     def reset(self, rng: Array) -> State:
-        """The task's own start, moved and seen with noise."""
+        """Return the task's own start, moved and seen with noise."""
         return self._begin(rng, self.env.reset)
 
     def restart(self, state: State, rng: Array, done: Array) -> State:
-        """The same as `envs.base.restart` has it."""
+        """Restart as `envs.base.restart`."""
         return self._begin(rng, lambda key: restart(self.env, state, key, done))
 
     def _begin(self, rng: Array, reset: Callable[[Array], State]) -> State:
@@ -59,17 +55,17 @@ class Noisy(Wrapper):
                 for k, x in ((q_key, physics.qpos), (v_key, physics.qvel))
             )
             state = self.env.set_state(state, *moved)
-        return self._seen(state, o_key, key)
+        return self._observed(state, o_key, key)
 
     def step(self, state: State, action: Array) -> State:
-        """One step of the task, from its true observation."""
+        """Step the task from its true observation."""
         key, a_key, r_key, o_key = jax.random.split(state.info["noise_key"], 4)
         action = action + self._action * jax.random.normal(a_key, action.shape)
         after = self.env.step(state.replace(obs=state.info["true_obs"]), action)
         after = after.replace(reward=after.reward + self._reward * jax.random.normal(r_key))
-        return self._seen(after, o_key, key)
+        return self._observed(after, o_key, key)
 
-    def _seen(self, state: State, key: Array, rest: Array) -> State:
+    def _observed(self, state: State, key: Array, next_key: Array) -> State:
         true: Any = state.obs
         obs = true + self._observation * jax.random.normal(key, true.shape)
-        return state.replace(obs=obs, info={**state.info, "true_obs": true, "noise_key": rest})
+        return state.replace(obs=obs, info={**state.info, "true_obs": true, "noise_key": next_key})

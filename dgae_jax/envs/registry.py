@@ -1,13 +1,12 @@
-"""The tasks by name: where each is built, what it runs on, who evaluates it.
+"""The tasks by name: builder, engines, and the Gymnasium env that evaluates them.
 
-Importing this loads no task, so that names can be checked before JAX, MuJoCo and Brax are imported.
+Importing this loads no task: names are checked before JAX, MuJoCo and Brax are imported.
 """
 
 import sys
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from importlib.util import find_spec
-from pkgutil import resolve_name
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from dgae_jax.physics.registry import ENGINES
@@ -15,37 +14,32 @@ from dgae_jax.physics.registry import ENGINES
 if TYPE_CHECKING:
     from dgae_jax.envs.base import Env
 
-BRAX = "brax:"
-"""Before the name of an environment of Brax's own."""
-PLAYGROUND = "playground:"
-"""Before the name of a task of MuJoCo Playground."""
-GYMNASIUM = "gymnasium:"
-"""Before the id of a task of Gymnasium."""
-CUSTOM = "custom:"
-"""Before the name of the class of an environment that is given as an object."""
+BRAX, PLAYGROUND, GYMNASIUM, CUSTOM = "brax:", "playground:", "gymnasium:", "custom:"
+"""Prefixes of third-party tasks, and of envs that are given as objects."""
 
 BRAX_NAMES = (
-    "ant", "fast", "halfcheetah", "hopper", "humanoid", "humanoidstandup", "inverted_pendulum", "inverted_double_pendulum",
-    "pusher", "reacher", "walker2d",
+    "ant", "fast", "halfcheetah", "hopper", "humanoid", "humanoidstandup", "inverted_pendulum",
+    "inverted_double_pendulum", "pusher", "reacher", "walker2d",
 )  # fmt: skip
-"""Environments of Brax's own that it builds on its MJX backend; its swimmer is not one of them."""
+"""Brax's own environments that it builds on its MJX backend; its swimmer is not one of them."""
+
+CUSTOM_ENVS: dict[str, Any] = {}
+"""Envs that were given as objects, by their names with the prefix."""
 
 
 class EnvSpec(NamedTuple):
-    """What exists of a task."""
+    """A task that can be built and evaluated."""
 
-    builder: str
-    """`module:function` of (*arguments, physics, version, **task_parameters), which returns the environment."""
-    arguments: tuple[str, ...]
+    build: Callable[..., "Env"]
+    """Called with physics, version and task parameters."""
     engines: tuple[str, ...]
-    """Names of the engines it runs on; the first is the default."""
-    referees: Mapping[str, str]
-    """Gymnasium's id for each version, the first of them the default. Empty for a task without versions, which is evaluated in
-    its own engine."""
+    """Engines that the task runs on; the first is the default."""
+    eval_envs: Mapping[str, str]
+    """Gymnasium's id for each version, the default first; empty for a task without versions."""
     gymnasium_id: str | None = None
-    """Gymnasium's id of a task that is one of Gymnasium's and has no versions here."""
+    """Gymnasium's id of a third-party task of Gymnasium."""
     on_host: bool = False
-    """Whether its worlds are Python objects on the host: for a CPU, a single device, and no exact resume."""
+    """True if its envs are Python objects: for a CPU, a single device, and no exact resume."""
 
     @property
     def default_engine(self) -> str:
@@ -53,115 +47,133 @@ class EnvSpec(NamedTuple):
         return self.engines[0]
 
     @property
-    def versions(self) -> tuple[str, ...]:
-        """Gymnasium's versions whose semantics the task has; empty where it has none."""
-        return tuple(self.referees)
-
-    @property
     def default_version(self) -> str | None:
         """The version where none is named; None for a task without versions."""
-        return next(iter(self.referees), None)
+        return next(iter(self.eval_envs), None)
 
-    def referee(self, version: str | None = None) -> str | None:
-        """Gymnasium's id of the task that evaluates policies; None: the task itself, in its own engine."""
-        return self.referees[version or self.versions[0]] if self.referees else self.gymnasium_id
+    @property
+    def versions(self) -> tuple[str, ...]:
+        """Gymnasium's versions whose semantics the task has; empty where it has none."""
+        return tuple(self.eval_envs)
+
+    def eval_env(self, version: str | None = None) -> str | None:
+        """Return Gymnasium's id of the evaluation env; None if the task evaluates itself."""
+        return self.eval_envs[version or self.versions[0]] if self.versions else self.gymnasium_id
 
     def choose(
         self, physics: str | None = None, version: str | None = None
     ) -> tuple[str, str | None]:
-        """Engine and version, with the defaults filled in; raises ValueError, naming what is allowed."""
+        """Return engine and version, with the defaults filled in.
+
+        Raises:
+            ValueError: if the task does not have them.
+        """
         physics = self.default_engine if physics is None else physics
         version = self.default_version if version is None else version
         if physics not in self.engines:
             raise ValueError(f"physics {physics}: must be one of {', '.join(self.engines)}")
         if version is not None and version not in self.versions:
-            raise ValueError(
-                f"version {version}: must be {'one of ' + ', '.join(self.versions) if self.versions else 'left out'}"
-            )
+            allowed = f"one of {', '.join(self.versions)}" if self.versions else "left out"
+            raise ValueError(f"version {version}: must be {allowed}")
         return physics, version
 
 
-def _ours(name: str) -> EnvSpec:
-    return EnvSpec(
-        f"dgae_jax.envs.gym_tasks:{name}.make",
-        (),
-        tuple(ENGINES),
-        {v: f"{name}-{v}" for v in ("v4", "v5")},
-    )
+def _gym_task(name: str) -> EnvSpec:
+    def build(physics, version, **task_parameters) -> "Env":
+        from dgae_jax.envs.gym_tasks import GYM_TASKS
+
+        return GYM_TASKS[name.lower()].make(physics, version, **task_parameters)
+
+    return EnvSpec(build, tuple(ENGINES), {v: f"{name}-{v}" for v in ("v4", "v5")})
 
 
-TASKS = {name.lower(): _ours(name) for name in ("Ant", "Hopper", "Swimmer", "Walker2d")}
+TASKS = {
+    "ant": _gym_task("Ant"),
+    "hopper": _gym_task("Hopper"),
+    "swimmer": _gym_task("Swimmer"),
+    "walker2d": _gym_task("Walker2d"),
+}
 
 
 def _brax(name: str) -> EnvSpec:
-    if name not in _brax_names():
-        raise ValueError(f"{BRAX}NAME with NAME one of {', '.join(_brax_names())}")
-    return EnvSpec("dgae_jax.envs.brax:make", (name,), ("mjx",), {})
-
-
-def _brax_names() -> list[str]:
-    """Brax's own names and those that somebody registered with it."""
     brax: Any = sys.modules.get("brax.envs")
-    registered = (
-        ()
-        if brax is None
-        else (n for n in brax._envs if not n.startswith("dgae_") and n != "swimmer")
-    )
-    return sorted({*BRAX_NAMES, *registered})
+    registered = () if brax is None else brax._envs  # by users too
+    names = {*BRAX_NAMES, *(n for n in registered if not n.startswith("dgae_"))} - {"swimmer"}
+    if name not in names:
+        raise ValueError(f"{BRAX}NAME with NAME one of {', '.join(sorted(names))}")
+
+    def build(physics, version, **task_parameters) -> "Env":
+        from dgae_jax.envs.brax import make_brax
+
+        return make_brax(name, physics, **task_parameters)
+
+    return EnvSpec(build, ("mjx",), {})
 
 
 def _playground(name: str) -> EnvSpec:
     if find_spec("mujoco_playground") is None:
         raise ValueError(
-            'used with the package playground, which is not installed: pip install "dgae_jax[playground]"'
+            "used with the package playground, which is not installed:"
+            ' pip install "dgae_jax[playground]"'
         )
-    return EnvSpec("dgae_jax.envs.playground:make", (name,), ("mjx", "mjx-warp"), {})
+
+    def build(physics, version, **task_parameters) -> "Env":
+        from dgae_jax.envs.playground import make_playground
+
+        return make_playground(name, physics, **task_parameters)
+
+    return EnvSpec(build, ("mjx", "mjx-warp"), {})
 
 
 def _gymnasium(name: str) -> EnvSpec:
-    return EnvSpec(
-        "dgae_jax.envs.gymnasium:make", (name,), ("gymnasium",), {}, gymnasium_id=name, on_host=True
-    )
+    def build(physics, version, **task_parameters) -> "Env":
+        from dgae_jax.envs.gymnasium import GymnasiumTask
+
+        return GymnasiumTask(name, **task_parameters)
+
+    return EnvSpec(build, ("gymnasium",), {}, gymnasium_id=name, on_host=True)
 
 
-GIVEN: dict[str, Any] = {}
-"""Environments that were given as objects, by their names with the prefix."""
+def _custom(name: str) -> EnvSpec:
+    env = CUSTOM_ENVS.get(CUSTOM + name)
+    if env is None:
+        raise ValueError(
+            "given as an object from Python: dgae_jax.train(config, run_dir, env=…),"
+            " load_policy(run_dir, env=…)"
+        )
+
+    def build(physics, version) -> "Env":
+        from dgae_jax.envs.custom import make_custom
+
+        return make_custom(env)
+
+    return EnvSpec(build, ("custom",), {})
+
+
+PREFIXES = {BRAX: _brax, PLAYGROUND: _playground, GYMNASIUM: _gymnasium, CUSTOM: _custom}
+"""Lookup of the name after a prefix; raises ValueError with "one of …" for an unknown one."""
+
+NAMES = (
+    f"one of {', '.join(TASKS)}, or {BRAX}NAME, {PLAYGROUND}NAME or {GYMNASIUM}ID"
+    " for a third-party task"
+)
+"""The names that a task may have, for messages."""
 
 
 @contextmanager
-def given(env: Any) -> Iterator[str | None]:
-    """Let the object `env` be a task while the context lasts, by the name of its class, which is yielded; None does nothing."""
+def custom_env(env: Any) -> Iterator[str | None]:
+    """Register an env object, if any, as a task while the context lasts; yield its name."""
     if env is None:
         yield None
         return
     name = CUSTOM + type(getattr(env, "unwrapped", env)).__name__
-    before, GIVEN[name] = GIVEN.get(name), env
+    before, CUSTOM_ENVS[name] = CUSTOM_ENVS.get(name), env
     try:
         yield name
     finally:
-        del GIVEN[name]
+        del CUSTOM_ENVS[name]
         if before is not None:
-            GIVEN[name] = before
-
-
-def _custom(name: str) -> EnvSpec:
-    if CUSTOM + name not in GIVEN:
-        raise ValueError(
-            "given as an object from Python: dgae_jax.train(config, run_dir, env=…), load_policy(run_dir, env=…)"
-        )
-    return EnvSpec("dgae_jax.envs.given:make", (name,), ("custom",), {})
-
-
-PREFIXES: dict[str, Callable[[str], EnvSpec]] = {
-    BRAX: _brax,
-    PLAYGROUND: _playground,
-    GYMNASIUM: _gymnasium,
-    CUSTOM: _custom,
-}
-"""Whose tasks a name means, and what exists of the one whose name follows; raises ValueError, naming what is allowed."""
-
-NAMES = f"one of {', '.join(TASKS)}, or {BRAX}NAME, {PLAYGROUND}NAME or {GYMNASIUM}ID for a task of somebody else's"
-"""What a task's name must be."""
+            CUSTOM_ENVS[name] = before
 
 
 def canonical_name(name: str) -> tuple[str, str | None]:
@@ -174,32 +186,40 @@ def canonical_name(name: str) -> tuple[str, str | None]:
 
 
 def spec_of(name: str) -> EnvSpec:
-    """What exists of the task `name`; raises ValueError with "one of …" for an unknown one."""
+    """Return the spec of a task.
+
+    Raises:
+        ValueError: with "one of …", if the task is unknown.
+    """
     if name in TASKS:
         return TASKS[name]
-    for prefix, of_others in PREFIXES.items():
+    for prefix, lookup in PREFIXES.items():
         if name.startswith(prefix) and name != prefix:
-            return of_others(name.removeprefix(prefix))
+            return lookup(name.removeprefix(prefix))
     raise ValueError(NAMES)
 
 
 def make_env(
     name: str, *, physics: str | None = None, version: str | None = None, **task_parameters
 ) -> "Env":
-    """The task `name` over the engine `physics`, with Gymnasium's semantics of `version`: by default `jax` and `v4`.
+    """Build a task.
 
-    `task_parameters` are those of Gymnasium's constructor. Tasks of others are `brax:NAME` on `mjx`, `playground:NAME` on `mjx` or
-    `mjx-warp`, and `gymnasium:ID`; their parameters are those of their own constructors. Raises ValueError, naming what is allowed,
-    for an unknown name, an engine that the task does not run on or that is not installed, and a version that it does not have.
+    Args:
+        name: `ant`, `hopper`, `swimmer`, `walker2d`, `brax:NAME`, `playground:NAME` or
+            `gymnasium:ID`.
+        physics: key of `ENGINES`; by default the first that the task runs on, `jax` for ours.
+        version: Gymnasium's version whose semantics the task has, `v4` (default) or `v5`.
+        **task_parameters: those of Gymnasium's constructor, or of the third-party one.
+
+    Raises:
+        ValueError: if the task is unknown, does not run on the engine, or the engine is not
+            installed.
     """
     name, named_version = canonical_name(name)
     if named_version and version not in (None, named_version):
         raise ValueError(f"version {version}: must be {named_version} as in the name, or left out")
-    version = version or named_version
     try:
         spec = spec_of(name)
     except ValueError as allowed:
         raise ValueError(f"environment {name}: must be {allowed}") from None
-    return resolve_name(spec.builder)(
-        *spec.arguments, *spec.choose(physics, version), **task_parameters
-    )
+    return spec.build(*spec.choose(physics, version or named_version), **task_parameters)

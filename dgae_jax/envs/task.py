@@ -1,9 +1,10 @@
-"""What Gymnasium's MuJoCo tasks share, as a `brax.envs.base.Env` over any physics engine.
+"""Common base of Gymnasium's MuJoCo tasks, a `brax.envs.base.Env` over any physics engine.
 
-What differs between tasks is a method, what differs between versions a line that names the version. The time limit
-belongs to the rollout, not to the task.
+A difference between tasks is a method, one between versions a line that names the version. The time
+limit belongs to the rollout, not to the task.
 """
 
+from dataclasses import KW_ONLY, dataclass
 from importlib.util import find_spec
 from math import inf
 from pathlib import Path
@@ -20,22 +21,34 @@ from dgae_jax.physics.registry import make_physics
 
 
 def load_spec(filename: str) -> mujoco.MjSpec:
-    """A model file of the installed gymnasium package, read without importing gymnasium."""
+    """Read a model file of the installed gymnasium package, without importing gymnasium.
+
+    Args:
+        filename: name in Gymnasium's `assets`, `hopper.xml` for example.
+    """
     spec = find_spec("gymnasium")
     if spec is None or not spec.submodule_search_locations:
-        raise ModuleNotFoundError(
-            "the model files come from the package gymnasium, which is not installed"
-        )
+        raise ModuleNotFoundError("the model files are those of gymnasium, which is not installed")
     path = Path(spec.submodule_search_locations[0]) / "envs" / "mujoco" / "assets" / filename
     return mujoco.MjSpec.from_file(str(path))
 
 
+@dataclass(eq=False)
 class Task(Env):
-    """Move forward: the frame that the four tasks share.
+    """Move forward, with a cost on the controls.
 
-    Actions are the actuators' controls; the control cost takes them as given, MuJoCo clips them. `metrics` hold the
-    reward's terms, the position [m] and the velocity [m/s].
+    Actions are the actuators' controls; the control cost takes them as given, MuJoCo clips them.
+    `metrics` hold the terms of the reward, the position [m] and the velocity [m/s]. The fields are
+    Gymnasium's parameters, by its names.
     """
+
+    physics: Physics
+    version: str
+    _: KW_ONLY
+    forward_reward_weight: float = 1.0
+    ctrl_cost_weight: float
+    reset_noise_scale: float
+    exclude_current_positions_from_observation: bool = True
 
     FILE: ClassVar[dict[str, str]]
     """Model file by version."""
@@ -43,176 +56,145 @@ class Task(Env):
     NAME: ClassVar[str]
     """Gymnasium's name, without the version."""
     AXES: ClassVar[int]
-    """Leading positions that the observation leaves out: one for x, two for x and y."""
+    """Leading positions that the observation excludes: one for x, two for x and y."""
     VELOCITY_LIMIT: ClassVar[float] = inf
-    """Observed velocities are clipped to ± this."""
-    TERMS: ClassVar[tuple[str, ...]]
-    """Names of the reward's terms."""
-
-    def __init__(
-        self,
-        physics: Physics,
-        version: str,
-        *,
-        forward_reward_weight: float = 1.0,
-        ctrl_cost_weight: float,
-        reset_noise_scale: float,
-        exclude_current_positions_from_observation: bool = True,
-    ):
-        self._physics, self._version = physics, version
-        self._forward_reward_weight = forward_reward_weight
-        self._ctrl_cost_weight = ctrl_cost_weight
-        self._reset_noise_scale = reset_noise_scale
-        self._first_position = self.AXES * exclude_current_positions_from_observation
-        self._init_qpos = jnp.asarray(physics.model.qpos0)
+    """Bound on observed velocities."""
+    TERMS: ClassVar[tuple[str, ...]] = ("reward_forward", "reward_ctrl")
+    """Names of the terms of the reward."""
 
     @classmethod
     def make(cls, physics: str, version: str, **parameters) -> "Task":
-        """The task over the engine named `physics`."""
+        """Build the task over the engine named `physics`."""
         spec, reads = load_spec(cls.FILE[version]), cls.reads(version, **parameters)
         return cls(make_physics(physics, spec, cls.FRAME_SKIP, reads), version, **parameters)
 
-    # ---- what a task may say differently ----
+    # ---- to override in a task ----
 
     @staticmethod
     def reads(version: str, **parameters) -> Reads:
-        """What reward and observation use besides positions and velocities."""
+        """Return the quantities that reward and observation need besides `qpos` and `qvel`."""
         return Reads()
 
     def _terms(
         self, before: PhysicsState, after: PhysicsState, action: Array, velocity: Array
     ) -> dict[str, Array]:
-        """The reward's terms, in the order of `TERMS`; their sum is the reward."""
+        """Return the terms of the reward, in the order of `TERMS`; their sum is the reward."""
         return {
-            "reward_forward": self._forward_reward_weight * velocity[0],
-            "reward_ctrl": -self._ctrl_cost_weight * jnp.square(action).sum(),
+            "reward_forward": self.forward_reward_weight * velocity[0],
+            "reward_ctrl": -self.ctrl_cost_weight * jnp.square(action).sum(),
         }
 
-    def _is_over(self, physics: PhysicsState) -> Bool[Array, ""]:
+    def _is_over(self, state: PhysicsState) -> Bool[Array, ""]:
         return jnp.asarray(False)
 
-    def _position(self, physics: PhysicsState) -> Float[Array, " A"]:
-        """Where the reward looks: x, or x and y [m]."""
-        return physics.qpos[: self.AXES]
+    def _position(self, state: PhysicsState) -> Float[Array, " A"]:
+        """Return the rewarded position: x, or x and y [m]."""
+        return state.qpos[: self.AXES]
 
     def _velocity_noise(self, key: Array) -> Float[Array, " V"]:
-        return self._uniform(key, self._physics.model.nv)
+        return self._uniform(key, self.physics.model.nv)
 
-    def _observation(self, physics: PhysicsState) -> Float[Array, " O"]:
-        velocity = jnp.clip(physics.qvel, -self.VELOCITY_LIMIT, self.VELOCITY_LIMIT)
-        return jnp.concatenate([physics.qpos[self._first_position :], velocity])
+    def _observation(self, state: PhysicsState) -> Float[Array, " O"]:
+        velocity = jnp.clip(state.qvel, -self.VELOCITY_LIMIT, self.VELOCITY_LIMIT)
+        first = self.AXES * self.exclude_current_positions_from_observation
+        return jnp.concatenate([state.qpos[first:], velocity])
 
-    # ---- the environment ----
+    # ---- Brax's contract ----
 
     @property
     def dt(self) -> float:
         """Seconds of simulated time per environment step."""
-        return self._physics.model.opt.timestep * self.FRAME_SKIP
+        return self.physics.model.opt.timestep * self.FRAME_SKIP
 
     @property
     def observation_size(self) -> int:
         """Length of the observation."""
-        nq, nv = self._physics.model.nq, self._physics.model.nv
-        return jax.eval_shape(
-            lambda: self._observation(self._physics.init(jnp.zeros(nq), jnp.zeros(nv)))
-        ).shape[0]
+        model = self.physics.model
+        state = self.physics.init(jnp.zeros(model.nq), jnp.zeros(model.nv))
+        return jax.eval_shape(self._observation, state).shape[0]
 
     @property
     def action_size(self) -> int:
         """Number of actuators."""
-        return self._physics.model.nu
+        return self.physics.model.nu
 
     @property
     def action_range(self) -> tuple[Float[Array, " A"], Float[Array, " A"]]:
         """The actuators' lowest and highest control."""
-        low, high = self._physics.model.actuator_ctrlrange.T
+        low, high = self.physics.model.actuator_ctrlrange.T
         return jnp.asarray(low), jnp.asarray(high)
 
     @property
     def backend(self) -> str:
         """Name of the physics."""
-        return self._physics.name
+        return self.physics.name
 
     def reset(self, rng: Array) -> State:
-        """A fresh random pose: noise of `reset_noise_scale` on positions and velocities."""
+        """Return a random pose: noise of `reset_noise_scale` on positions and velocities."""
         q_key, v_key = jax.random.split(rng)
-        qpos = self._init_qpos + self._uniform(q_key, self._physics.model.nq)
-        return self._at(self._physics.init(qpos, self._velocity_noise(v_key)))
+        model = self.physics.model
+        qpos = jnp.asarray(model.qpos0) + self._uniform(q_key, model.nq)
+        return self._at(self.physics.init(qpos, self._velocity_noise(v_key)))
 
     def set_state(self, state: State, qpos: ArrayLike, qvel: ArrayLike) -> State:
-        """`state` moved to a pose, qpos [Q] and qvel [V], as Gymnasium's `set_state`; the solver starts cold."""
-        return self._at(
-            self._physics.init(
-                jnp.asarray(qpos, state.obs.dtype), jnp.asarray(qvel, state.obs.dtype)
-            )
-        )
+        """Return `state` moved to a pose, as Gymnasium's `set_state`; the solver starts cold.
+
+        Args:
+            state: any state of the task.
+            qpos: positions [Q].
+            qvel: velocities [V].
+        """
+        qpos, qvel = (jnp.asarray(x, state.obs.dtype) for x in (qpos, qvel))
+        return self._at(self.physics.init(qpos, qvel))
 
     def step(self, state: State, action: Float[Array, " A"]) -> State:
-        """One control interval of `dt` seconds. `done` is 1 where the task terminated; time limits are the rollout's."""
+        """Advance one control interval of `dt` seconds; `done` is 1 where the task terminated."""
         before: Any = state.pipeline_state
-        after = self._physics.step(before, action)
-        velocity = (self._position(after) - self._position(before)) / self.dt
+        after = self.physics.step(before, action)
+        position = self._position(after)
+        velocity = (position - self._position(before)) / self.dt
         terms = self._terms(before, after, action, velocity)
         return state.replace(
             pipeline_state=after,
             obs=self._observation(after),
             reward=sum(terms.values()),
             done=self._is_over(after).astype(velocity.dtype),
-            metrics={
-                **state.metrics,
-                **terms,
-                **self._whereabouts(self._position(after), velocity),
-            },
+            metrics={**state.metrics, **terms, **self._motion_metrics(position, velocity)},
         )
 
-    def _at(self, physics: PhysicsState) -> State:
-        zero, position = jnp.zeros((), physics.qpos.dtype), self._position(physics)
-        metrics = dict.fromkeys(self.TERMS, zero) | self._whereabouts(
-            position, jnp.zeros_like(position)
-        )
-        return State(physics, self._observation(physics), zero, zero, metrics)  # pyright: ignore[reportArgumentType]
+    def _at(self, physics_state: PhysicsState) -> State:
+        position, zero = self._position(physics_state), jnp.zeros((), physics_state.qpos.dtype)
+        motion = self._motion_metrics(position, jnp.zeros_like(position))
+        metrics = dict.fromkeys(self.TERMS, zero) | motion
+        return State(physics_state, self._observation(physics_state), zero, zero, metrics)  # pyright: ignore[reportArgumentType]
 
-    def _whereabouts(self, position: Array, velocity: Array) -> dict[str, Array]:
-        named = {"position": position, "velocity": velocity}
-        return {
-            f"{axis}_{what}": value[i]
-            for what, value in named.items()
-            for i, axis in enumerate("xy"[: self.AXES])
-        }
+    def _motion_metrics(self, position: Array, velocity: Array) -> dict[str, Array]:
+        named, axes = (("position", position), ("velocity", velocity)), "xy"[: self.AXES]
+        return {f"{axis}_{name}": x[i] for name, x in named for i, axis in enumerate(axes)}
 
     def _uniform(self, key: Array, size: int) -> Array:
-        return jax.random.uniform(
-            key, (size,), minval=-self._reset_noise_scale, maxval=self._reset_noise_scale
-        )
+        scale = self.reset_noise_scale
+        return jax.random.uniform(key, (size,), minval=-scale, maxval=scale)
 
 
+@dataclass(eq=False)
 class HealthyTask(Task):
-    """A task that pays for staying healthy and ends when the body no longer is."""
+    """A task with a reward for being healthy, which ends when the body is not."""
 
-    TERMS = ("reward_forward", "reward_ctrl", "reward_survive")
+    healthy_reward: float = 1.0
+    terminate_when_unhealthy: bool = True
 
-    def __init__(
-        self,
-        physics: Physics,
-        version: str,
-        *,
-        healthy_reward: float = 1.0,
-        terminate_when_unhealthy: bool = True,
-        **parameters,
-    ):
-        super().__init__(physics, version, **parameters)
-        self._healthy_reward = healthy_reward
-        self._terminate_when_unhealthy = terminate_when_unhealthy
+    TERMS = (*Task.TERMS, "reward_survive")
 
-    def _is_healthy(self, physics: PhysicsState) -> Bool[Array, ""]:
+    def _is_healthy(self, state: PhysicsState) -> Bool[Array, ""]:
         raise NotImplementedError
 
-    def _is_over(self, physics: PhysicsState) -> Bool[Array, ""]:
-        return ~self._is_healthy(physics) & self._terminate_when_unhealthy
+    def _is_over(self, state: PhysicsState) -> Bool[Array, ""]:
+        return ~self._is_healthy(state) & self.terminate_when_unhealthy
 
     def _terms(self, before, after, action, velocity):
         healthy = self._is_healthy(after)
-        if self._version == "v4":  # pays on the terminating step too
-            healthy = healthy | self._terminate_when_unhealthy
-        survive = self._healthy_reward * healthy.astype(velocity.dtype)
+        if self.version == "v4":  # pays on the terminating step too
+            healthy = healthy | self.terminate_when_unhealthy
+        survive = self.healthy_reward * healthy.astype(velocity.dtype)
         return {**super()._terms(before, after, action, velocity), "reward_survive": survive}

@@ -71,8 +71,8 @@ class Renderer:
 
 def _model(env: str, version: str | None, width: int, height: int) -> mujoco.MjModel:
     """Load Gymnasium's model, in colors for print."""
-    name, _, version = str(spec_of(env).referee(version)).partition("-")
-    spec = load_spec(getattr(gym_tasks, name).FILE[version])
+    name, _, version = str(spec_of(env).eval_env(version)).partition("-")
+    spec = load_spec(gym_tasks.GYM_TASKS[name.lower()].FILE[version])
     for texture in spec.textures:
         if texture.type == mujoco.mjtTexture.mjTEXTURE_SKYBOX:
             texture.rgb1, texture.rgb2 = SKY

@@ -308,7 +308,7 @@ def make_vector_env(
 
 
 for _name, _spec in TASKS.items():
-    for _version, _id in _spec.referees.items():
+    for _version, _id in _spec.eval_envs.items():
         gymnasium.register(
             f"dgae_jax/{_id}",
             vector_entry_point=f"{__name__}:make_vector_env",

@@ -13,7 +13,7 @@ from dgae_jax.configs import parts, resolved
 from dgae_jax.configs.config import Config, ConfigError
 from dgae_jax.configs.resolved import Options, ResolvedConfig, resolve
 from dgae_jax.envs.base import Env
-from dgae_jax.envs.given import with_range
+from dgae_jax.envs.custom import with_range
 from dgae_jax.envs.noise import Noisy
 from dgae_jax.envs.registry import make_env
 from dgae_jax.learn import iteration, parallel

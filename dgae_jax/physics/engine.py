@@ -4,7 +4,7 @@ A task declares what it reads (`Reads`), and an engine returns it in a `PhysicsS
 functions of type `EngineBuilder`; `registry` names them.
 """
 
-from typing import NamedTuple, Protocol
+from typing import NamedTuple, Protocol, runtime_checkable
 
 import jax
 import jax.numpy as jnp
@@ -41,6 +41,7 @@ class PhysicsState(NamedTuple):
     """External torque and force on each body [Nm, N]; E = 0 unless `Reads.forces`."""
 
 
+@runtime_checkable
 class StepFn(Protocol):
     """Advance a state by one control interval; pure, may be jitted and vmapped."""
 
@@ -70,6 +71,7 @@ class Physics(NamedTuple):
         return PhysicsState(qpos, qvel, jnp.zeros_like(qvel), xpos, forces)
 
 
+@runtime_checkable
 class EngineBuilder(Protocol):
     """Compile a model for an engine; raises ValueError for a model that it does not cover."""
 

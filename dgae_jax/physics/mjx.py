@@ -12,25 +12,15 @@ import jax.numpy as jnp
 import mujoco
 from jaxtyping import Array
 
-from dgae_jax.physics.engine import (
-    Physics,
-    PhysicsState,
-    Reads,
-    body_ids,
-    refuse_hidden_state,
-    single_env,
-)
+from dgae_jax.physics import engine
+from dgae_jax.physics.engine import Physics, PhysicsState, Reads
 
 with contextlib.redirect_stdout(io.StringIO()):  # MJX prints that Warp is not installed
     from mujoco import mjx as upstream
 
 
 def mjx(spec: mujoco.MjSpec, frame_skip: int, reads: Reads) -> Physics:
-    """Build MJX over its JAX code, on any device.
-
-    Raises:
-        ValueError: if MJX does not cover the model.
-    """
+    """Build MJX over its JAX code, on any device."""
     model, bodies = _compile(spec, reads, "mjx")
     device_model = _put_model(model, "jax", "mjx")
 
@@ -49,9 +39,6 @@ def mjx_warp(spec: mujoco.MjSpec, frame_skip: int, reads: Reads) -> Physics:
     """Build MJX over MuJoCo Warp, in float32, for NVIDIA GPUs; on a CPU it is slow.
 
     All envs share a buffer of contacts, sized by Warp's default per env; Warp reports an overflow.
-
-    Raises:
-        ValueError: if MJX does not cover the model.
     """
     import warp  # pyright: ignore[reportMissingImports]
 
@@ -68,15 +55,14 @@ def mjx_warp(spec: mujoco.MjSpec, frame_skip: int, reads: Reads) -> Physics:
         def one(state: PhysicsState, ctrl: Array) -> PhysicsState:
             data = _substeps(device_model, blank, state, ctrl, frame_skip)
             cfrc_ext = data._impl.cfrc_ext if reads.forces else state.cfrc_ext
-            return PhysicsState(
-                data.qpos, data.qvel, data.qacc_warmstart, data.xpos[bodies], cfrc_ext
-            )
+            xpos = data.xpos[bodies]
+            return PhysicsState(data.qpos, data.qvel, data.qacc_warmstart, xpos, cfrc_ext)
 
         single = jax.tree.map(lambda x: x.astype(jnp.float32), (state, ctrl))
         after = jax.vmap(one, -1, -1)(*single)
         return jax.tree.map(lambda new, old: new.astype(old.dtype), after, state)
 
-    return Physics(model, single_env(batched_step), "mjx-warp", reads)
+    return Physics(model, engine.single_env(batched_step), "mjx-warp", reads)
 
 
 def _compile(spec: mujoco.MjSpec, reads: Reads, name: str):
@@ -85,8 +71,8 @@ def _compile(spec: mujoco.MjSpec, reads: Reads, name: str):
     for numeric in list(spec.numerics):  # MJX 3.17 takes the first for its own limit on contacts
         spec.delete(numeric)
     model = spec.compile()
-    refuse_hidden_state(model, name)
-    return model, body_ids(model, reads)
+    engine.refuse_hidden_state(model, name)
+    return model, engine.body_ids(model, reads)
 
 
 def _put_model(model: mujoco.MjModel, impl: str, name: str) -> upstream.Model:
@@ -102,6 +88,8 @@ def _substeps(
     data = data.replace(
         qpos=state.qpos, qvel=state.qvel, qacc_warmstart=state.qacc_warmstart, ctrl=ctrl
     )
-    return jax.lax.scan(
-        lambda d, _: (upstream.step(model, d), None), data, None, length=frame_skip
-    )[0]
+
+    def substep(data, _):
+        return upstream.step(model, data), None
+
+    return jax.lax.scan(substep, data, None, length=frame_skip)[0]

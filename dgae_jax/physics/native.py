@@ -27,10 +27,6 @@ _INPUTS = ("qpos", "qvel", "qacc_warmstart")
 
 WARNING_COUNTS: Counter[str] = Counter()
 """Warnings of C MuJoCo in this process while `native` stepped, by MuJoCo's name."""
-_WARNINGS = [
-    mujoco.mjtWarning(i).name.removeprefix("mjWARN_")
-    for i in range(int(mujoco.mjtWarning.mjNWARNING))
-]
 _lock, _callers, _handler = threading.Lock(), 0, None
 """Callers inside `silence_warnings`, and the handler to restore after the last one."""
 
@@ -55,14 +51,14 @@ def silence_warnings() -> Iterator[None]:
 
 def _count_warnings(new: np.ndarray) -> None:
     """Add new warnings, one number per kind; only the first of each kind is logged."""
-    for kind, number in zip(_WARNINGS, new.tolist(), strict=True):
-        if number and kind not in WARNING_COUNTS:
-            _LOG.warning(
-                "MuJoCo warns of %s in physics native; more of this kind are counted, not shown",
-                kind,
+    for i in np.flatnonzero(new).tolist():
+        kind = mujoco.mjtWarning(i).name.removeprefix("mjWARN_")
+        if kind not in WARNING_COUNTS:
+            message = (
+                "MuJoCo warns of %s in physics native; more of this kind are counted, not shown"
             )
-        if number:
-            WARNING_COUNTS[kind] += number
+            _LOG.warning(message, kind)
+        WARNING_COUNTS[kind] += int(new[i])
 
 
 class _Simulations:
@@ -79,9 +75,9 @@ class _Simulations:
         with self._batch(count) as batch, silence_warnings():
             for name, array in zip((*_INPUTS, "ctrl"), before, strict=True):
                 batch.bind(name)[:] = array.reshape(count, -1)
-            warned = _warnings(batch)
+            warnings = batch.warning[..., 1].sum(0)
             batch.step(nstep=self.frame_skip)
-            _count_warnings(_warnings(batch) - warned)
+            _count_warnings(batch.warning[..., 1].sum(0) - warnings)
             forces = self._forces(batch) if self.reads.forces else np.empty((count, 0, 6))
             values = (*map(batch.bind, _INPUTS), batch.bind("xpos")[:, self.bodies], forces)
             for array, value in zip(after, values, strict=True):
@@ -118,18 +114,10 @@ class _Simulations:
         return forces
 
 
-def _warnings(batch: Batch) -> np.ndarray:
-    """Return the warnings so far, by kind, summed over the simulations."""
-    return batch.warning[..., 1].sum(0)
-
-
 def native(spec: mujoco.MjSpec, frame_skip: int, reads: Reads) -> Physics:
     """Build C MuJoCo, advancing all envs of a batch on all cores of this process.
 
     A non-finite state stays visible: C's own silent reset of such states is switched off.
-
-    Raises:
-        ValueError: if the model has a state beyond positions and velocities.
     """
     model = spec.compile()
     refuse_hidden_state(model, "native")

@@ -14,7 +14,7 @@ import numpy as np
 from dgae_jax.configs.config import Config, ConfigError, invalid
 from dgae_jax.configs.resolved import ResolvedConfig, resolve
 from dgae_jax.envs.base import Env
-from dgae_jax.envs.registry import given
+from dgae_jax.envs.registry import custom_env
 from dgae_jax.learn.build import make_greedy, make_quantiles, make_task
 from dgae_jax.learn.types import InferenceState
 from dgae_jax.run import checkpoint, directory, metrics, terminal, training
@@ -110,7 +110,7 @@ def train(
         if name not in TrainOptions.__annotations__:
             allowed = ", ".join(TrainOptions.__annotations__)
             raise ConfigError(f"{name}: must be one of {allowed}")
-    with terminal.silenced(quiet), given(env) as name, _directory(run_dir) as path:
+    with terminal.silenced(quiet), custom_env(env) as name, _directory(run_dir) as path:
         config = config if name is None else dataclasses.replace(config, env=name)
         done = training.train(resolve(config), RunOptions(run_dir=path, **options))
         policy, rows = load_policy(path, env=env), metrics.read(path / "metrics.jsonl")
@@ -140,7 +140,7 @@ def load_policy(
         CheckpointError: no checkpoint can be read.
     """
     source = Path(run_dir)
-    with given(env) as name:
+    with custom_env(env) as name:
         config = directory.config_of(source)
         if name not in (None, config.env):
             raise invalid("env", name, f"left out: {run_dir} is a run of {config.env}")

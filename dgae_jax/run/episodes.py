@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from dgae_jax.configs.resolved import ResolvedConfig
-from dgae_jax.envs.registry import GIVEN, spec_of
+from dgae_jax.envs.registry import CUSTOM_ENVS, spec_of
 from dgae_jax.learn import play
 from dgae_jax.learn.build import make_greedy, make_policy, make_task, make_trainer
 from dgae_jax.learn.iteration import sampler
@@ -60,9 +60,9 @@ def make_eval_env(config: ResolvedConfig, max_steps: int | None = None) -> Any:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # that v4 is not the latest version is known
             return gymnasium.make(eval_env_id(config), max_episode_steps=limit)
-    from dgae_jax.envs.gymnasium import make_world
+    from dgae_jax.envs.gymnasium import make_gym_env
 
-    return gymnasium.wrappers.TimeLimit(make_world(eval_env_id(config)), limit)
+    return gymnasium.wrappers.TimeLimit(make_gym_env(eval_env_id(config)), limit)
 
 
 def time_limit(config: ResolvedConfig) -> int:
@@ -70,9 +70,9 @@ def time_limit(config: ResolvedConfig) -> int:
     gymnasium_id = spec_of(config.env).gymnasium_id
     if gymnasium_id is None:
         return config.episode_length
-    from dgae_jax.envs.gymnasium import make_world
+    from dgae_jax.envs.gymnasium import make_gym_env
 
-    env = make_world(gymnasium_id)
+    env = make_gym_env(gymnasium_id)
     env.close()
     own = env.spec and env.spec.max_episode_steps
     return min(config.episode_length, own or config.episode_length)
@@ -118,7 +118,7 @@ def gymnasium_returns(
 ) -> np.ndarray:
     """Return undiscounted returns [E] of the mean action in Gymnasium, side by side."""
     envs = [make_eval_env(config) for _ in range(episodes)]
-    greedy = _greedy(config, GIVEN.get(config.env))
+    greedy = _greedy(config, CUSTOM_ENVS.get(config.env))
     shape = (episodes, *envs[0].observation_space.shape)
     compile_in_thread(greedy, policy, np.zeros(shape, np.float32), watch=watch)
 
@@ -150,7 +150,7 @@ def jax_returns(
     policy: InferenceState, config: ResolvedConfig, episodes: int, seed: int, watch: Watch
 ) -> np.ndarray:
     """Return undiscounted returns [E] of the mean action in the physics of `config`."""
-    trainer, advance = _programs(config, GIVEN.get(config.env))
+    trainer, advance = _programs(config, CUSTOM_ENVS.get(config.env))
     envs = _fresh_envs(config, trainer, seed, episodes, watch)
     now = play.begin(envs)
     compile_in_thread(advance, policy, now, 1, watch=watch, what="compiling steps")

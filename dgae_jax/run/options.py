@@ -93,7 +93,7 @@ INTEGER_RANGES = {
 def engines_of(config: ResolvedConfig) -> tuple[str, ...]:
     """Return the engines that can evaluate a run, the default first."""
     spec = spec_of(config.env)
-    return ("gymnasium", *spec.engines) if spec.referees else spec.engines
+    return ("gymnasium", *spec.engines) if spec.eval_envs else spec.engines
 
 
 def engine_of(config: ResolvedConfig, engine: str | None, setting: str = "engine") -> str:
@@ -110,7 +110,7 @@ def engine_of(config: ResolvedConfig, engine: str | None, setting: str = "engine
 
 def eval_env_id(config: ResolvedConfig) -> str:
     """Return Gymnasium's id of the evaluation env, or our name where Gymnasium lacks the task."""
-    return spec_of(config.env).referee(config.env_version) or config.env
+    return spec_of(config.env).eval_env(config.env_version) or config.env
 
 
 def validate_options(options: RunOptions, config: ResolvedConfig) -> None:

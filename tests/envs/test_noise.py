@@ -24,28 +24,26 @@ def collect(env, key, num_steps=400):
     )[1]
 
 
-def test_without_noise_the_task_is_left_as_it_is():
-    assert not isinstance(make_task(dg.Config(env="hopper", physics="native")), Noisy)
-    assert isinstance(
-        make_task(dg.Config(env="hopper", physics="native", noise=dg.NoiseConfig(reward=1.0))),
-        Noisy,
-    )
+def test_task_is_wrapped_only_with_noise():
+    for noise in (dg.NoiseConfig(), dg.NoiseConfig(reward=1.0)):
+        config = dg.resolve(dg.Config(env="hopper", physics="native", noise=noise))
+        assert isinstance(make_task(config), Noisy) == (noise.reward > 0)
 
 
-def test_reward_noise_has_its_deviation_and_is_drawn_afresh(key):
+def test_reward_noise_has_its_deviation(key):
     reward = np.asarray(collect(Noisy(Constant(), reward=0.5), key).reward)
     assert_allclose([reward.mean(), reward.std()], [1, 0.5], atol=0.03)
     assert len(np.unique(reward)) > 0.99 * reward.size
 
 
-def test_observation_noise_is_seen_and_does_not_enter_the_task(key):
+def test_observation_noise_does_not_enter_the_task(key):
     step = collect(Noisy(Counter(), observation=0.1), key)
     truth = jnp.round(step.obs[..., 0])
     assert_allclose((step.obs[..., 0] - truth).std(), 0.1, atol=0.01)
     assert_array_equal(step.reward, truth + 1)  # the counter counts true steps
 
 
-def test_action_noise_reaches_the_task_and_not_the_record(key):
+def test_action_noise_reaches_the_task(key):
     env = Noisy(Counter(), action=0.2)
     state = jax.vmap(env.reset)(jax.random.split(key, 500))
     after = jax.vmap(env.step)(state, jnp.ones((500, 1)))
@@ -54,7 +52,7 @@ def test_action_noise_reaches_the_task_and_not_the_record(key):
     )
 
 
-def test_initial_noise_moves_the_start_of_our_tasks_and_is_refused_elsewhere(key):
+def test_initial_noise_is_for_our_own_tasks(key):
     env = Noisy(dg.make_env("swimmer", physics="native", reset_noise_scale=0.0), initial=0.3)
     qpos = jax.vmap(env.reset)(jax.random.split(key, 500)).pipeline_state.qpos
     assert_allclose(qpos.std(0), 0.3, atol=0.03)

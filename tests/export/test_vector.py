@@ -21,7 +21,7 @@ from gymnasium.wrappers.vector import NormalizeObservation, RecordEpisodeStatist
 from numpy.testing import assert_allclose, assert_array_equal
 
 import dgae_jax as dg
-from dgae_jax.envs.registry import given
+from dgae_jax.envs.registry import custom_env
 from dgae_jax.export import gl
 from dgae_jax.physics.registry import ENGINES
 from tests.helpers import GYM_TASKS
@@ -256,7 +256,7 @@ def test_gymnasium_makes_it_by_name():
     env = gymnasium.make_vec(name, num_envs=2, physics="native", healthy_reward=3.0)
     assert (env.spec.id, env.num_envs) == ("dgae_jax/Hopper-v5", 2)
     assert env.spec.kwargs["max_episode_steps"] == 1000
-    assert (env.env.dt, env.env._healthy_reward) == (0.008, 3)
+    assert (env.env.dt, env.env.healthy_reward) == (0.008, 3)
     names = {f"dgae_jax/{task.NAME}-{v}" for task in GYM_TASKS.values() for v in ("v4", "v5")}
     assert names <= set(gymnasium.registry)
 
@@ -357,7 +357,7 @@ env.close()
 
 
 def test_the_tasks_own_time_limit_truncates():
-    with given(EpisodeWrapper(Counter(), 5, 1)) as name:
+    with custom_env(EpisodeWrapper(Counter(), 5, 1)) as name:
         envs = dg.make_vector_env(name, 2)
     envs.reset(seed=0)
     ends = [envs.step(np.zeros((2, 1)))[2:4] for _ in range(5)]

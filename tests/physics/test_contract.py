@@ -1,4 +1,4 @@
-"""What holds for every engine: names, what a task may read, what state is carried."""
+"""The contract of every engine: names, bodies that a task may read, state that is carried."""
 
 import subprocess
 import sys
@@ -16,33 +16,32 @@ from tests.helpers import ROOT
 from tests.parity import WARP
 
 ALL = [pytest.param(name, marks=WARP) if name == "mjx-warp" else name for name in ENGINES]
-FOLLOWING = """<mujoco><option integrator='RK4'/><worldbody><body><joint name='j'/><geom size='.1'/></body></worldbody>
+HIDDEN_STATE = """<mujoco><option integrator='RK4'/>
+  <worldbody><body><joint name='j'/><geom size='.1'/></body></worldbody>
   <actuator><general joint='j' dyntype='integrator'/></actuator></mujoco>"""
 
 
-def test_the_tables_of_engines_and_tasks_load_no_engine():
+def test_registries_load_no_engine():
     code = """
 import sys, types
-package = types.ModuleType("dgae_jax"); package.__path__ = ["dgae_jax"]; sys.modules["dgae_jax"] = package
+package = types.ModuleType("dgae_jax")
+package.__path__, sys.modules["dgae_jax"] = ["dgae_jax"], package
 import dgae_jax.physics.registry as physics, dgae_jax.envs.registry as envs
 envs.spec_of("brax:ant"), physics.ENGINES
 print(sorted({"jax", "mujoco", "brax", "flax", "gymnasium", "warp"} & set(sys.modules)))"""
-    assert (
-        subprocess.run(
-            [sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True
-        ).stdout
-        == "[]\n"
-    )
+    command = [sys.executable, "-c", code]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True)
+    assert done.stdout == "[]\n"
 
 
-def test_an_unknown_engine_is_refused_with_what_exists():
+def test_unknown_engine_is_refused_with_the_names():
     with pytest.raises(
         ValueError, match="unknown physics 'bullet': must be one of jax, mjx, mjx-warp, native"
     ):
         make_physics("bullet", load_spec("hopper.xml"), 4, Reads())
 
 
-def test_an_engine_that_is_not_installed_is_refused_with_the_way_to_install_it(monkeypatch):
+def test_missing_engine_is_refused_with_how_to_install_it(monkeypatch):
     monkeypatch.setattr(registry, "find_spec", lambda name: None)
     registry.require("mjx")
     with pytest.raises(
@@ -56,22 +55,22 @@ def test_an_engine_that_is_not_installed_is_refused_with_the_way_to_install_it(m
     ("body", "reason"),
     [("tail", "no body 'tail'"), ("front_left_leg", "'front_left_leg' cannot be read")],
 )
-def test_a_body_that_an_engine_cannot_return_is_refused_by_name(engine, body, reason):
+def test_body_without_free_joint_is_refused(engine, body, reason):
     with pytest.raises(ValueError, match=reason):
         make_physics(engine, load_spec("ant.xml"), 5, Reads(bodies=(body,)))
 
 
 @pytest.mark.parametrize("engine", ALL)
-def test_a_model_with_a_state_that_is_not_carried_is_refused_by_name(engine):
+def test_model_with_hidden_state_is_refused(engine):
     with pytest.raises(ValueError, match=rf"physics {engine} does not cover .*activations"):
-        make_physics(engine, mujoco.MjSpec.from_string(FOLLOWING), 1, Reads())
+        make_physics(engine, mujoco.MjSpec.from_string(HIDDEN_STATE), 1, Reads())
 
 
-def test_a_reset_puts_floating_bodies_where_their_joints_say():
+def test_init_reads_floating_bodies_from_qpos():
     xml = """<mujoco><worldbody><body name='a' pos='1 1 1'><freejoint/><geom size='.1'/></body>
       <body name='b'><freejoint/><geom size='.1'/></body></worldbody></mujoco>"""
     model, reads = mujoco.MjModel.from_xml_string(xml), Reads(("b", "a"), forces=True)
-    state = Physics(model, lambda state, ctrl: state, "none", reads).at_pose(
+    state = Physics(model, lambda state, ctrl: state, "none", reads).init(
         jnp.arange(28.0).reshape(2, 14), jnp.zeros((2, 12))
     )
     assert_array_equal(body_ids(model, reads), [2, 1])

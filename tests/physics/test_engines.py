@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
+from dgae_jax.envs.gym_tasks import GYM_TASKS
 from dgae_jax.physics.engine import PhysicsState
-from tests.helpers import GYM_TASKS
 from tests.parity import UPSTREAM, WARP, errors, reference, stepped
 
 MODELS = sorted(GYM_TASKS)
@@ -24,14 +24,13 @@ def test_native_is_mj_step_bit_for_bit(name):
 FLOAT32 = [
     *(("jax", name) for name in MODELS),
     pytest.param("mjx-warp", "hopper", marks=WARP),
-    pytest.param("mjx-warp", "swimmer", marks=(WARP, slow)),
-    pytest.param("mjx-warp", "walker2d", marks=(WARP, slow)),
+    *(pytest.param("mjx-warp", name, marks=(WARP, slow)) for name in ("swimmer", "walker2d")),
     pytest.param("mjx-warp", "ant", marks=(WARP, slow, UPSTREAM)),
 ]
 
 
 @pytest.mark.parametrize(("engine", "name"), FLOAT32)
-def test_in_float32_an_engine_agrees_with_c_mujoco_after_a_control_interval(engine, name):
+def test_float32_control_interval_agrees_with_c(engine, name):
     got, want = stepped(name, engine), reference(name)[0]
     assert_allclose(got.qpos, want.qpos, atol=1e-4)
     assert_allclose(got.qvel, want.qvel, atol=1e-3)
@@ -41,15 +40,13 @@ def test_in_float32_an_engine_agrees_with_c_mujoco_after_a_control_interval(engi
 
 FLOAT64 = [
     *(("jax", name) for name in MODELS),
-    ("mjx", "hopper"),
-    pytest.param("mjx", "swimmer", marks=slow),
-    pytest.param("mjx", "walker2d", marks=slow),
+    *(pytest.param("mjx", name, marks=slow) for name in MODELS if name != "ant"),
     pytest.param("mjx", "ant", marks=(slow, UPSTREAM)),
 ]
 
 
 @pytest.mark.parametrize(("engine", "name"), FLOAT64)
-def test_in_float64_an_engine_differs_from_c_mujoco_by_rounding(engine, name):
+def test_float64_control_interval_differs_from_c_by_rounding(engine, name):
     error = errors(name, engine, x64=True)
     # C's solver stops at a tolerance, which Ant's light legs show
     assert np.quantile(error, 0.99) < 1e-7
@@ -63,14 +60,14 @@ def test_in_float64_an_engine_differs_from_c_mujoco_by_rounding(engine, name):
     ("engine", "x64"),
     [pytest.param("mjx", True, marks=slow), pytest.param("mjx-warp", False, marks=(WARP, slow))],
 )
-def test_ant_in_mjx_agrees_with_c_mujoco_in_most_states_only(engine, x64):
-    # what users of the engine get until upstream mends it: half of the states agree to 1e-3, fallen ones do not
+def test_ant_in_mjx_agrees_with_c_in_most_states(engine, x64):
+    # until upstream mends it: half of the states agree to 1e-3, fallen ones do not
     error = errors("ant", engine, x64=x64)
     assert np.median(error) < 1e-3
     assert error.max() < 10
 
 
 @pytest.mark.parametrize("name", MODELS)
-def test_the_states_reach_contacts_where_a_model_has_any(name):
+def test_states_have_contacts_where_a_model_has_any(name):
     contacts = reference(name)[1]
     assert contacts.max() == 0 if name == "swimmer" else (contacts > 0).mean() > 0.1

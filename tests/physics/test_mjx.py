@@ -1,4 +1,4 @@
-"""MuJoCo MJX: how worlds are vmapped, and what is refused."""
+"""MuJoCo MJX: agreement with C, vmapping, refusals."""
 
 import subprocess
 import sys
@@ -13,17 +13,30 @@ from dgae_jax.envs.task import load_spec
 from dgae_jax.physics.engine import Reads
 from dgae_jax.physics.registry import make_physics
 from tests.helpers import ROOT
-from tests.parity import WARP, reference, states
+from tests.parity import FEET, WARP, reference, states
+
+
+def test_a_capsule_on_the_ground_moves_as_in_c():
+    spec, model = FEET.copy(), FEET.compile()
+    data = mujoco.MjData(model)
+    data.qpos[:] = -0.12, 0.2
+    with jax.enable_x64(True):
+        physics = make_physics("mjx", spec, 3, Reads())
+        state = physics.init(jnp.asarray(data.qpos), jnp.zeros(2))
+        after = jax.jit(physics.step)(state, jnp.zeros(0))
+    mujoco.mj_step(model, data, nstep=3)
+    assert data.ncon > 0
+    assert_allclose(after.qvel, data.qvel, atol=1e-9)
 
 
 @WARP
-def test_warp_learns_the_number_of_worlds_from_the_vmap():
+def test_warp_steps_any_nesting_of_vmaps():
     physics, want = (
         make_physics("mjx-warp", load_spec("hopper.xml"), 4, Reads()),
         reference("hopper")[0],
     )
     qpos, qvel, warmstart, ctrl = (jnp.asarray(x) for x in states("hopper"))
-    state = physics.at_pose(qpos, qvel)._replace(qacc_warmstart=warmstart)
+    state = physics.init(qpos, qvel)._replace(qacc_warmstart=warmstart)
     many = jax.jit(jax.vmap(physics.step))(state, ctrl)
     few = jax.jit(jax.vmap(physics.step))(*jax.tree.map(lambda x: x[:5], (state, ctrl)))
     grid = jax.tree.map(lambda x: x[:12].reshape(3, 4, *x.shape[1:]), (state, ctrl))
@@ -36,23 +49,22 @@ def test_warp_learns_the_number_of_worlds_from_the_vmap():
 
 
 @WARP
-def test_warp_keeps_the_dtype_of_the_state_it_was_given():
+def test_warp_keeps_the_dtype_of_the_state():
     with jax.enable_x64(True):
         physics = make_physics("mjx-warp", load_spec("swimmer.xml"), 1, Reads())
-        after = jax.eval_shape(
-            physics.step, physics.at_pose(jnp.zeros(5), jnp.zeros(5)), jnp.zeros(2)
-        )
+        after = jax.eval_shape(physics.step, physics.init(jnp.zeros(5), jnp.zeros(5)), jnp.zeros(2))
     assert after.qpos.dtype == after.qvel.dtype == "float64"
 
 
 @pytest.mark.parametrize("engine", ["mjx", pytest.param("mjx-warp", marks=WARP)])
-def test_a_model_that_mjx_does_not_cover_is_refused_with_its_reason(engine):
-    xml = "<mujoco><option solver='PGS'/><worldbody><body><joint/><geom size='.1'/></body></worldbody></mujoco>"
+def test_model_that_mjx_does_not_cover_is_refused(engine):
+    spec = FEET.copy()
+    spec.option.solver = mujoco.mjtSolver.mjSOL_PGS
     with pytest.raises(ValueError, match=rf"physics {engine} does not cover this model: .*PGS"):
-        make_physics(engine, mujoco.MjSpec.from_string(xml), 1, Reads())
+        make_physics(engine, spec, 1, Reads())
 
 
-def test_the_models_numerics_which_mjx_misreads_are_left_out_of_a_copy():
+def test_numerics_are_left_out_of_a_copy():
     spec = load_spec("ant.xml")
     assert len(spec.numerics) == 1
     assert make_physics("mjx", spec, 5, Reads()).model.nnumeric == 0
@@ -60,17 +72,15 @@ def test_the_models_numerics_which_mjx_misreads_are_left_out_of_a_copy():
 
 
 @WARP
-def test_warp_announces_neither_itself_nor_its_kernels():
+def test_warp_prints_nothing():
     code = """
 import jax, jax.numpy as jnp
 from dgae_jax.envs.task import load_spec
 from dgae_jax.physics.engine import Reads
 from dgae_jax.physics.registry import make_physics
 physics = make_physics("mjx-warp", load_spec("hopper.xml"), 4, Reads())
-jax.block_until_ready(jax.jit(physics.step)(physics.at_pose(jnp.zeros(6), jnp.zeros(6)), jnp.zeros(3)))"""
-    assert (
-        subprocess.run(
-            [sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True
-        ).stdout
-        == ""
-    )
+state = physics.init(jnp.zeros(6), jnp.zeros(6))
+jax.block_until_ready(jax.jit(physics.step)(state, jnp.zeros(3)))"""
+    command = [sys.executable, "-c", code]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True)
+    assert done.stdout == ""

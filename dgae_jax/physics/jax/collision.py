@@ -1,7 +1,4 @@
-"""Contacts of spheres and capsules with planes and with each other.
-
-`contact_groups` reads the pairs of geoms from the model, once; `collision` finds the contacts.
-"""
+"""Contacts of spheres and capsules with planes and with each other."""
 
 from collections.abc import Iterator
 from typing import NamedTuple
@@ -13,16 +10,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from dgae_jax.physics.jax.math import constant, dot, matvec, normalize
-from dgae_jax.physics.jax.model import (
-    CAPSULE,
-    PLANE,
-    Constants,
-    Model,
-    Pose,
-    SolverParams,
-    quat_to_mat,
-    solver_params,
-)
+from dgae_jax.physics.jax.model import CAPSULE, PLANE, Constants, Model, SolverParams, quat_to_mat
 
 _MAX_CONTACTS = {("ant", 25): 8, ("walker2d", 14): 10}
 """More ground contacts than Gymnasium's models ever have, by name and number of possible ones."""
@@ -32,13 +20,11 @@ class Geoms(NamedTuple):
     """K spheres or capsules, fixed to frames of joints."""
 
     frame: np.ndarray
-    """[K] frame that the geom is fixed to."""
     pos: np.ndarray
-    """[K 3] `geom_pos` in that frame [m]."""
+    """[K 3] center in that frame [m]."""
     half: np.ndarray
     """[K 3] half the axis of a capsule in that frame [m]; zero for a sphere."""
     radius: np.ndarray
-    """[K] `geom_size[0]` [m]."""
 
 
 class ContactParams(NamedTuple):
@@ -61,7 +47,7 @@ class ContactGroup(NamedTuple):
     """None for the ground, a plane."""
     geom2: Geoms
     plane: np.ndarray
-    """[K 4] normal and offset of the ground [1, m]."""
+    """[K 4] normal and offset of the ground [1, m]; empty without."""
     frictionless: bool
     """True if `contact.dim` is 1; it is 3 otherwise."""
     max_contacts: int
@@ -91,12 +77,7 @@ def known_max_contacts(name: str, model: mujoco.MjModel) -> int | None:
 
 
 def contact_groups(m: Model, max_contacts: int | None = None) -> list[ContactGroup]:
-    """Read the possible contacts of a model.
-
-    Args:
-        m: the model.
-        max_contacts: bound on contacts with the ground, of which the nearest are kept.
-    """
+    """Read the possible contacts; `max_contacts` bounds those with the ground."""
     mj = m.mj
     pairs: dict[tuple[bool, bool], list[tuple[int, int]]] = {}
     for pair in _geom_pairs(mj):
@@ -136,35 +117,25 @@ def _group(
     invweight = mj.body_invweight0[bodies, 0].sum(1)
     if not frictionless:
         invweight = 2 * friction**2 / mj.opt.impratio * (1 + friction**2) * invweight
-    solver = solver_params(
-        mj,
-        margin=mj.geom_margin[pairs].sum(1),
-        invweight=invweight,
-        solref=mj.geom_solref[pairs].mean(1),
-        solimp=mj.geom_solimp[pairs].mean(1),
-    )
+    solref, solimp = mj.geom_solref[pairs].mean(1), mj.geom_solimp[pairs].mean(1)
+    solver = SolverParams.create(mj, mj.geom_margin[pairs].sum(1), invweight, solref, solimp)
     dofs = np.concatenate([np.zeros((1, mj.nv)), m.body_dofs])[bodies]
+    params = ContactParams(solver, friction, dofs[:, 1] - dofs[:, 0], bodies)
+    if not ground:
+        plane = np.empty((0, 4))
+        return ContactGroup(params, _geoms(m, one), geom2, plane, frictionless, len(pairs))
     normals = np.array([quat_to_mat(mj.geom_quat[g])[:, 2] for g in one])
     plane = np.c_[normals, (normals * mj.geom_pos[one]).sum(1)]
-    params = ContactParams(solver, friction, dofs[:, 1] - dofs[:, 0], bodies)
-    kept = min(len(pairs), max_contacts) if ground and max_contacts is not None else len(pairs)
-    return ContactGroup(
-        params, None if ground else _geoms(m, one), geom2, plane, frictionless, kept
-    )
+    kept = min(len(pairs), len(pairs) if max_contacts is None else max_contacts)
+    return ContactGroup(params, None, geom2, plane, frictionless, kept)
 
 
 def _geoms(m: Model, geoms: np.ndarray) -> Geoms:
     mj = m.mj
-    poses: list[Pose] = [
-        m.bodies[mj.geom_bodyid[g]].at(mj.geom_pos[g], mj.geom_quat[g]) for g in geoms
-    ]
+    poses = [m.bodies[mj.geom_bodyid[g]].at(mj.geom_pos[g], mj.geom_quat[g]) for g in geoms]
+    frame, pos, mat = (np.array(x) for x in zip(*poses, strict=True))
     length = mj.geom_size[geoms, 1] * (mj.geom_type[geoms] == CAPSULE)
-    return Geoms(
-        np.array([pose.frame for pose in poses]),
-        np.array([pose.pos for pose in poses]),
-        np.array([pose.mat[:, 2] for pose in poses]) * length[:, None],
-        mj.geom_size[geoms, 0],
-    )
+    return Geoms(frame, pos, mat[:, :, 2] * length[:, None], mj.geom_size[geoms, 0])
 
 
 def collision(groups: list[ContactGroup], frames: Float[Array, "F 3 4 N"]) -> list[Contact]:

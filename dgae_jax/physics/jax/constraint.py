@@ -38,7 +38,7 @@ def make_constraint(
     qvel: Float[Array, "V N"],
 ) -> Constraint:
     """Compute the rows of all limits, then of all contacts."""
-    rows = [_limit_rows(m, qpos, qvel)] if len(m.limited) else []
+    rows = [_limit_rows(m, qpos, qvel)] if m.mj.jnt_limited.any() else []
     for group, contact in zip(groups, contacts, strict=True):
         rows.append(_contact_rows(group.frictionless, contact, smooth, qvel))
     efc_J, efc_D, efc_aref = zip(*rows, strict=True)
@@ -46,12 +46,16 @@ def make_constraint(
 
 
 def _limit_rows(m: Model, qpos: Array, qvel: Array) -> Constraint:
-    low, high = (constant(x, qpos.dtype) for x in m.mj.jnt_range[m.limited].T)
-    q = qpos[m.mj.jnt_qposadr[m.limited]]
+    mj, joints, dtype = m.mj, np.flatnonzero(m.mj.jnt_limited), qpos.dtype
+    dofs = mj.jnt_dofadr[joints]
+    low, high = (constant(x, dtype) for x in mj.jnt_range[joints].T)
+    q = qpos[mj.jnt_qposadr[joints]]
     at_low = q - low < high - q
-    axis = constant(np.eye(m.mj.nv)[:, m.mj.jnt_dofadr[m.limited]], qpos.dtype)
-    params, dist = as_arrays(m.limit_params, qpos.dtype), jnp.where(at_low, q - low, high - q)
-    return _rows(params, axis * jnp.where(at_low, 1, -1), dist, qvel)
+    axis, dist = constant(np.eye(mj.nv)[:, dofs], dtype), jnp.where(at_low, q - low, high - q)
+    solref, solimp = mj.jnt_solref[joints], mj.jnt_solimp[joints]
+    invweight = mj.dof_invweight0[dofs]
+    params = SolverParams.create(mj, mj.jnt_margin[joints], invweight, solref, solimp)
+    return _rows(as_arrays(params, dtype), axis * jnp.where(at_low, 1, -1), dist, qvel)
 
 
 def _contact_rows(frictionless: bool, contact: Contact, smooth: Smooth, qvel: Array) -> Constraint:
@@ -98,7 +102,7 @@ def rne_postconstraint(
     efc_force: Float[Array, "C N"],
 ) -> Float[Array, "B 6 N"]:
     """Compute `cfrc_ext`: torque about the center of mass of the tree and force on each body."""
-    nbody, start = m.mj.nbody, len(m.limited)
+    nbody, start = m.mj.nbody, np.count_nonzero(m.mj.jnt_limited)
     cfrc_ext = jnp.zeros((nbody, 6, subtree_com.shape[-1]), subtree_com.dtype)
     for group, contact in zip(groups, contacts, strict=True):
         edges, count = 1 if group.frictionless else 4, len(contact.dist)

@@ -18,10 +18,8 @@ from dgae_jax.physics.jax.smooth import smooth
 
 _RK4_A = (0.0, 0.5, 0.5, 1.0)
 _RK4_B = (1 / 6, 1 / 3, 1 / 3, 1 / 6)
-_BLOCK = 128
-"""Envs computed together on a CPU, so that what they need fits its cache."""
-_HAS_RKMK = int(mujoco.__version__.split(".")[0]) >= 4
-"""True if C MuJoCo corrects the rotation of a free joint in RK4."""
+_BLOCK = 128  # envs computed together on a CPU, to fit its cache
+_HAS_RKMK = int(mujoco.__version__.split(".")[0]) >= 4  # C corrects the rotation of a free joint
 
 
 def jax_engine(
@@ -29,15 +27,8 @@ def jax_engine(
 ) -> Physics:
     """Build MuJoCo in JAX.
 
-    Args:
-        spec: the model.
-        frame_skip: substeps per control interval.
-        reads: the quantities that the task reads besides positions and velocities.
-        max_contacts: bound on contacts with the ground, of which the nearest are kept; by default
-            the bound that is known for the model, or all that are possible.
-
-    Raises:
-        ValueError: if the engine does not cover the model.
+    `max_contacts` bounds the contacts with the ground, of which the nearest are kept; by default it
+    is the bound that is known for the model, or all that are possible.
     """
     model = spec.compile()
     m = put_model(model)
@@ -52,7 +43,7 @@ def jax_engine(
         s = smooth(m, qpos, qvel, ctrl)
         xpos = jnp.repeat(s.frames[:1, :, 3], bodies, 0)
         cfrc_ext = jnp.zeros((model.nbody if reads.forces else 0, 6, qpos.shape[-1]), qpos.dtype)
-        if not len(m.limited) and not groups:
+        if not groups and not model.jnt_limited.any():
             return math.solve(s.qM, s.qfrc_smooth), (xpos, cfrc_ext)
         contacts = collision(groups, s.frames)
         constraint = make_constraint(m, groups, contacts, s, qpos, qvel)
@@ -84,9 +75,10 @@ def jax_engine(
 
     @jax.default_matmul_precision("highest")  # TF32 on GPUs is too coarse for dynamics
     def step(state: PhysicsState, ctrl: Array) -> PhysicsState:
-        return jax.lax.scan(
-            lambda s, _: (rungekutta4(s, ctrl), None), state, None, length=frame_skip
-        )[0]
+        def substep(state, _):
+            return rungekutta4(state, ctrl), None
+
+        return jax.lax.scan(substep, state, None, length=frame_skip)[0]
 
     return Physics(model, single_env(_in_blocks(step)), "jax", reads)
 

@@ -26,18 +26,32 @@ class Pose(NamedTuple):
 
 
 class SolverParams(NamedTuple):
-    """Solver parameters of K limits or contacts."""
+    """Solver parameters of K limits or contacts.
+
+    `k` and `b` are stiffness and damping of the reference acceleration, `solimp` is clipped.
+    """
 
     margin: Constants
-    """[K] `jnt_margin` or `contact.includemargin` [m, rad]: active below this distance."""
+    """[K] the constraint is active below this distance [m, rad]."""
     invweight: Constants
     """[K] `efc_diagApprox`: approximate inverse inertia along the row [1/kg, 1/(kg m²)]."""
     k: Constants
-    """[K] stiffness of the reference acceleration, from `solref` [1/s²]."""
     b: Constants
-    """[K] damping of the reference acceleration, from `solref` [1/s]."""
     solimp: Constants
     """[K 5] d_0, d_width, width, midpoint, power."""
+
+    @classmethod
+    def create(cls, mj: mujoco.MjModel, margin, invweight, solref, solimp) -> "SolverParams":
+        """Read `solref`: time constant and damping ratio or, if negative, k and b."""
+        low, high, width, midpoint, power = solimp.T
+        limits = mujoco.mjMINIMP, mujoco.mjMAXIMP
+        low, high, midpoint = (np.clip(x, *limits) for x in (low, high, midpoint))
+        timeconst, dampratio = solref.T
+        safe = np.maximum(timeconst, 2 * mj.opt.timestep)
+        k = np.where(timeconst > 0, 1 / (high * safe * dampratio) ** 2, -timeconst / high**2)
+        b = np.where(dampratio > 0, 2 / (high * safe), -dampratio / high)
+        width, power = np.maximum(width, mujoco.mjMINVAL), np.maximum(power, 1)
+        return cls(margin, invweight, k, b, np.stack([low, high, width, midpoint, power], 1))
 
 
 class Model(NamedTuple):
@@ -63,9 +77,6 @@ class Model(NamedTuple):
     """[V V] 1 where the second degree of freedom moves the axis of the first."""
     actuator_moment: np.ndarray
     """[V U] force per unit of control."""
-    limited: np.ndarray
-    """Joints with `jnt_limited`."""
-    limit_params: SolverParams
 
 
 def quat_to_mat(quat: np.ndarray) -> np.ndarray:
@@ -102,26 +113,9 @@ def put_model(model: mujoco.MjModel) -> Model:
     moment, gain = np.zeros((model.nv, model.nu)), model.actuator_gainprm[:, 0]
     dof = model.jnt_dofadr[model.actuator_trnid[:, 0]]
     moment[dof, np.arange(model.nu)] = model.actuator_gear[:, 0] * gain
-    limited = np.flatnonzero(model.jnt_limited)
-    return Model(
-        model,
-        free,
-        bodies,
-        [p.at(model.body_ipos[i], model.body_iquat[i]) for i, p in enumerate(bodies)][1:],
-        np.array(parents, int),
-        np.reshape(terms, (-1, 4, 3, 4)),
-        dofs[1:],
-        ancestors,
-        moment,
-        limited,
-        solver_params(
-            model,
-            margin=model.jnt_margin[limited],
-            invweight=model.dof_invweight0[model.jnt_dofadr[limited]],
-            solref=model.jnt_solref[limited],
-            solimp=model.jnt_solimp[limited],
-        ),
-    )
+    inertial = [p.at(model.body_ipos[i], model.body_iquat[i]) for i, p in enumerate(bodies)][1:]
+    parents, terms = np.array(parents, int), np.reshape(terms, (-1, 4, 3, 4))
+    return Model(model, free, bodies, inertial, parents, terms, dofs[1:], ancestors, moment)
 
 
 def _joint_terms(model: mujoco.MjModel, joint: int, pose: Pose) -> np.ndarray:
@@ -137,79 +131,53 @@ def _joint_terms(model: mujoco.MjModel, joint: int, pose: Pose) -> np.ndarray:
     return terms
 
 
-def solver_params(
-    model: mujoco.MjModel,
-    *,
-    margin: np.ndarray,
-    invweight: np.ndarray,
-    solref: np.ndarray,
-    solimp: np.ndarray,
-) -> SolverParams:
-    """Return k, b and the clipped impedance, as `_kbi` of MJX.
-
-    `solref` is time constant and damping ratio or, if negative, stiffness and damping.
-    """
-    low, high, width, midpoint, power = solimp.T
-    low, high, midpoint = (
-        np.clip(x, mujoco.mjMINIMP, mujoco.mjMAXIMP) for x in (low, high, midpoint)
-    )
-    timeconst, dampratio = solref.T
-    safe = np.maximum(timeconst, 2 * model.opt.timestep)
-    k = np.where(timeconst > 0, 1 / (high * safe * dampratio) ** 2, -timeconst / high**2)
-    b = np.where(dampratio > 0, 2 / (high * safe), -dampratio / high)
-    width, power = np.maximum(width, mujoco.mjMINVAL), np.maximum(power, 1)
-    return SolverParams(margin, invweight, k, b, np.stack([low, high, width, midpoint, power], 1))
-
-
 def _refuse_uncovered(m: mujoco.MjModel) -> None:
     joint, geom, opt = mujoco.mjtJoint, mujoco.mjtGeom, m.opt
     free, root = m.jnt_type == FREE, np.arange(m.njnt) == 0
     simple = np.isin(m.jnt_type, [SLIDE, int(joint.mjJNT_HINGE)]) | root & free
     collides = (m.geom_contype | m.geom_conaffinity) > 0
-    round_geom = np.isin(m.geom_type, [int(geom.mjGEOM_SPHERE), CAPSULE])
     moving = m.body_weldid[m.geom_bodyid] != 0
-    shaped = np.where(m.geom_bodyid == 0, m.geom_type == PLANE, round_geom & moving)
+    round_geom = np.isin(m.geom_type, [int(geom.mjGEOM_SPHERE), CAPSULE]) & moving
+    shaped = np.where(m.geom_bodyid == 0, m.geom_type == PLANE, round_geom)
     motor = (
         (m.actuator_trntype == int(mujoco.mjtTrn.mjTRN_JOINT))
         & ~free[np.minimum(m.actuator_trnid[:, 0], m.njnt - 1)]
         & (m.actuator_gaintype == int(mujoco.mjtGain.mjGAIN_FIXED))
         & (m.actuator_biastype == int(mujoco.mjtBias.mjBIAS_NONE))
     )
+    integrator, rk4 = mujoco.mjtIntegrator(opt.integrator), mujoco.mjtIntegrator.mjINT_RK4
+    overlap = 2 * m.jnt_margin > np.ptp(m.jnt_range, axis=1)
+    fluid, flags = opt.density + opt.viscosity > 0, opt.disableflags | opt.enableflags
+    mixing = m.geom_priority, m.geom_solmix
     reasons = {
-        f"integrator {mujoco.mjtIntegrator(opt.integrator).name}": opt.integrator
-        != mujoco.mjtIntegrator.mjINT_RK4,
+        f"integrator {integrator.name}": integrator != rk4,
         "ball joints, or free joints below the root": ~simple,
-        "springs at free joints": m.jnt_stiffness[free] != 0,
+        "springs at free joints": m.jnt_stiffness[free],
         "more than one tree": m.body_rootid[1:] != 1,
-        "activations": m.na > 0,
+        "activations": m.na,
         "actuators other than motors at hinges and slides": ~motor,
         "limits on forces": np.r_[m.actuator_forcelimited, m.jnt_actfrclimited],
-        "equality constraints": m.neq > 0,
-        "tendons": m.ntendon > 0,
-        "friction loss": m.dof_frictionloss > 0,
+        "equality constraints": m.neq,
+        "tendons": m.ntendon,
+        "friction loss": m.dof_frictionloss,
         "elliptic friction cones": opt.cone != mujoco.mjtCone.mjCONE_PYRAMIDAL,
         "torsional friction": collides & (m.geom_condim > 3),
         "contacts without friction": collides & (m.geom_friction[:, 0] < mujoco.mjMINMU),
-        "joint limits with margins that overlap": (m.jnt_limited > 0)
-        & (2 * m.jnt_margin > np.ptp(m.jnt_range, axis=1)),
-        "bodies without mass in a fluid": (m.body_mass[1:] < mujoco.mjMINVAL)
-        & (opt.density + opt.viscosity > 0),
-        "contact pairs or exclusions": m.npair + m.nexclude > 0,
+        "joint limits with margins that overlap": (m.jnt_limited > 0) & overlap,
+        "bodies without mass in a fluid": fluid & (m.body_mass[1:] < mujoco.mjMINVAL),
+        "contact pairs or exclusions": m.npair + m.nexclude,
         "colliding geoms other than spheres and capsules over planes": collides & ~shaped,
         "contact softness given as stiffness and damping": collides[:, None] & (m.geom_solref <= 0),
-        "geoms of different priority or weight": (m.geom_priority != m.geom_priority[:1])
-        | (m.geom_solmix != m.geom_solmix[:1]),
-        "gravity compensation": m.body_gravcomp != 0,
-        "wind": opt.wind != 0,
-        "the ellipsoid fluid model": m.geom_fluid[:, 0] != 0,
-        "option flags other than the default": opt.disableflags
-        | opt.enableflags
-        | opt.disableactuator,
+        "geoms of different priority or weight": [np.ptp(x) for x in mixing if len(x)],
+        "gravity compensation": m.body_gravcomp,
+        "wind": opt.wind,
+        "the ellipsoid fluid model": m.geom_fluid[:, 0],
+        "option flags other than the default": flags | opt.disableactuator,
     }
     # fields of newer versions of MuJoCo, all zero in a plain model
     for name in ("jnt_stiffnesspoly", "dof_dampingpoly", "actuator_armature", "actuator_damping",
                  "actuator_dampingpoly", "actuator_delay"):  # fmt: skip
-        reasons[name.replace("_", " ")] = getattr(m, name, np.zeros(1)) != 0
+        reasons[name.replace("_", " ")] = getattr(m, name, 0)
     found = [reason for reason, present in reasons.items() if np.any(present)]
     if found:
         raise ValueError(f"physics jax does not cover {', '.join(found)}, which the model has")

@@ -12,19 +12,8 @@ import mujoco
 import numpy as np
 from jaxtyping import Array, Float
 
-from dgae_jax.physics.jax.math import (
-    Inertia,
-    constant,
-    cross,
-    dot,
-    inert_mul,
-    masked_sum,
-    matmul,
-    matvec,
-    motion_cross,
-    motion_cross_force,
-    quat_to_mat,
-)
+from dgae_jax.physics.jax import math
+from dgae_jax.physics.jax.math import Inertia, constant, cross, dot, masked_sum, matmul, matvec
 from dgae_jax.physics.jax.model import SLIDE, Model
 
 
@@ -43,27 +32,18 @@ class Smooth(NamedTuple):
     """Motors, springs, dampers, gravity, fluid and bias [N, N m]."""
 
 
-class _Bodies(NamedTuple):
-    """Pose and inertia of the B moving bodies."""
-
-    xmat: Float[Array, "B 3 3 N"]
-    offset: Float[Array, "B 3 N"]
-    """`xipos`, from the center of mass of the tree [m]."""
-    cinert: Inertia
-
-
 def smooth(
     m: Model, qpos: Float[Array, "Q N"], qvel: Float[Array, "V N"], ctrl: Float[Array, "U N"]
 ) -> Smooth:
     """Compute everything but constraints."""
     frames = kinematics(m, qpos)
-    subtree_com, cdof, bodies = com_pos(m, frames)
+    xmat, offset, subtree_com, cdof, cinert = com_pos(m, frames)
     cvel, cacc = com_vel(m, cdof, qvel)
-    cfrc = inert_mul(bodies.cinert, cacc)
-    cfrc = cfrc + motion_cross_force(cvel, inert_mul(bodies.cinert, cvel))
+    cfrc = math.inert_mul(cinert, cacc)
+    cfrc = cfrc + math.motion_cross_force(cvel, math.inert_mul(cinert, cvel))
     if m.mj.opt.density > 0 or m.mj.opt.viscosity > 0:
-        cfrc = cfrc - _inertia_box_fluid_model(m, bodies, cvel)
-    qM, qfrc_bias = crb_rne(m, cdof, bodies.cinert, cfrc)
+        cfrc = cfrc - _inertia_box_fluid_model(m, xmat, offset, cvel)
+    qM, qfrc_bias = crb_rne(m, cdof, cinert, cfrc)
     return Smooth(frames, subtree_com, cdof, qM, _applied(m, qpos, qvel, ctrl) - qfrc_bias)
 
 
@@ -79,7 +59,7 @@ def kinematics(m: Model, qpos: Float[Array, "Q N"]) -> Float[Array, "F 3 4 N"]:
     )
     root = constant(np.eye(3, 4), qpos.dtype) + 0 * qpos[0]
     if m.has_free_root:
-        root = jnp.concatenate([quat_to_mat(qpos[3:7]), qpos[:3, None]], 1)
+        root = jnp.concatenate([math.quat_to_mat(qpos[3:7]), qpos[:3, None]], 1)
 
     def attach(frames, joint):
         frame, parent, pose = joint
@@ -99,24 +79,21 @@ def kinematics(m: Model, qpos: Float[Array, "Q N"]) -> Float[Array, "F 3 4 N"]:
     return jax.lax.platform_dependent(frames, local, cpu=loop, default=unrolled)
 
 
-def com_pos(m: Model, frames: Float[Array, "F 3 4 N"]) -> tuple[Array, Array, _Bodies]:
-    """Compute `subtree_com`, `cdof` and the inertia of the bodies about it."""
-    dtype = frames.dtype
-    body = frames[np.array([pose.frame for pose in m.bodies[1:]])]
+def com_pos(m: Model, frames: Float[Array, "F 3 4 N"]):
+    """Compute `xmat`, `xipos` from the center of mass, `subtree_com`, `cdof` and `cinert`."""
+    dtype, body = frames.dtype, frames[np.array([pose.frame for pose in m.bodies[1:]])]
     xmat, mass = body[:, :, :3], constant(m.mj.body_mass[1:, None], dtype)
     ipos = constant(np.array([pose.pos for pose in m.inertial]), dtype)
     xipos = body[:, :, 3] + matvec(xmat, ipos)
     subtree_com = jnp.sum(mass * xipos, 0) / m.mj.body_mass.sum()
-    cdof = _cdof(m, frames, subtree_com)
-    offset = xipos - subtree_com
+    cdof, offset = _cdof(m, frames, subtree_com), xipos - subtree_com
     inertia = zip(m.inertial, m.mj.body_inertia[1:], strict=True)
-    local = np.array([pose.mat * i @ pose.mat.T for pose, i in inertia])
-    turned = matmul(matmul(xmat, constant(local, dtype)), jnp.swapaxes(xmat, 1, 2))
+    local = constant(np.array([pose.mat * i @ pose.mat.T for pose, i in inertia]), dtype)
+    turned = matmul(matmul(xmat, local), jnp.swapaxes(xmat, 1, 2))
     square = dot(offset, offset)[:, None, None] * constant(np.eye(3), dtype)
-    steiner = constant(m.mj.body_mass[1:, None, None], dtype) * (
-        square - offset[:, :, None] * offset[:, None]
-    )
-    return subtree_com, cdof, _Bodies(xmat, offset, Inertia(turned + steiner, mass * offset, mass))
+    outer = offset[:, :, None] * offset[:, None]
+    steiner = constant(m.mj.body_mass[1:, None, None], dtype) * (square - outer)
+    return xmat, offset, subtree_com, cdof, Inertia(turned + steiner, mass * offset, mass)
 
 
 def _cdof(m: Model, frames: Array, subtree_com: Array) -> Array:
@@ -143,7 +120,7 @@ def com_vel(m: Model, cdof: Array, qvel: Array) -> tuple[Array, Array]:
     sums = masked_sum(np.concatenate([m.body_dofs, m.dof_ancestors]), motion)
     cvel, dof_vel = jnp.split(sums, [len(m.body_dofs)])
     gravity = constant(np.r_[np.zeros(3), m.mj.opt.gravity], cdof.dtype)
-    return cvel, masked_sum(m.body_dofs, motion_cross(dof_vel, motion)) - gravity
+    return cvel, masked_sum(m.body_dofs, math.motion_cross(dof_vel, motion)) - gravity
 
 
 def crb_rne(m: Model, cdof: Array, cinert: Inertia, cfrc: Array) -> tuple[Array, Array]:
@@ -156,7 +133,7 @@ def crb_rne(m: Model, cdof: Array, cinert: Inertia, cfrc: Array) -> tuple[Array,
     mass = constant((m.body_dofs.T @ m.mj.body_mass[1:])[:, None], cdof.dtype)
     crb = Inertia(moved[:, :9].reshape(-1, 3, 3, cdof.shape[-1]), moved[:, 9:12], mass)
     qfrc_bias = dot(cdof, moved[:, 12:])
-    momentum = inert_mul(crb, cdof)
+    momentum = math.inert_mul(crb, cdof)
     # entry i, j ≤ i: the motion of j on the momentum of all that i moves
     half = sum(momentum[:, None, k] * cdof[None, :, k] for k in range(6))
     related = (m.body_dofs[m.mj.dof_bodyid - 1] * np.tri(m.mj.nv))[..., None] > 0
@@ -180,14 +157,13 @@ def _applied(m: Model, qpos: Array, qvel: Array, ctrl: Array) -> Array:
     return force
 
 
-def _inertia_box_fluid_model(m: Model, bodies: _Bodies, cvel: Array) -> Array:
+def _inertia_box_fluid_model(m: Model, xmat: Array, offset: Array, cvel: Array) -> Array:
     """Return drag and viscosity on each body as on the box of its inertia."""
     mass, inertia, dtype = m.mj.body_mass[1:, None], m.mj.body_inertia[1:], cvel.dtype
-    viscosity, density, offset = m.mj.opt.viscosity, m.mj.opt.density, bodies.offset
-    ximat = matmul(bodies.xmat, constant(np.array([pose.mat for pose in m.inertial]), dtype))
-    box = np.sqrt(
-        6 * np.maximum(inertia.sum(1, keepdims=True) - 2 * inertia, mujoco.mjMINVAL) / mass
-    )
+    viscosity, density = m.mj.opt.viscosity, m.mj.opt.density
+    ximat = matmul(xmat, constant(np.array([pose.mat for pose in m.inertial]), dtype))
+    square = np.maximum(inertia.sum(1, keepdims=True) - 2 * inertia, mujoco.mjMINVAL) / mass
+    box = np.sqrt(6 * square)
     x, y, z = box.T
     area = np.stack([y * z, x * z, x * y], 1)
     spin = np.stack([x * (y**4 + z**4), y * (x**4 + z**4), z * (x**4 + y**4)], 1)
@@ -200,7 +176,6 @@ def _inertia_box_fluid_model(m: Model, bodies: _Bodies, cvel: Array) -> Array:
 
     angular, linear = cvel[:, :3], cvel[:, 3:]
     torque = resist(angular, np.pi * viscosity * diameter**3, density * spin / 64)
-    force = resist(
-        linear + cross(angular, offset), 3 * np.pi * viscosity * diameter, density * area / 2
-    )
+    linear = linear + cross(angular, offset)
+    force = resist(linear, 3 * np.pi * viscosity * diameter, density * area / 2)
     return jnp.concatenate([torque + cross(offset, force), force], 1)

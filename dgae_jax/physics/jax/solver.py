@@ -15,24 +15,18 @@ from jaxtyping import Array, Bool, Float, Int
 
 from dgae_jax.physics.jax import math
 
-ITERATIONS = 20
-"""Most Newton steps; measured, the tasks need at most a dozen."""
+ITERATIONS = 20  # measured, the tasks need at most a dozen
 LS_ITERATIONS = 8
-"""Most steps of the exact line search on a piecewise quadratic."""
-UNCHECKED = 2
-"""Newton steps on an accelerator between checks for convergence, each a round trip to the host."""
+UNCHECKED = 2  # steps on an accelerator between checks, each a round trip to the host
 
 
 class Problem(NamedTuple):
-    """The problem of N envs: V degrees of freedom, C constraint rows."""
+    """The problem of N envs; `qfrc_smooth` is M qacc_smooth, the rows are those of `Constraint`."""
 
     qM: Float[Array, "V V N"]
     qfrc_smooth: Float[Array, "V N"]
-    """M qacc_smooth."""
     efc_J: Float[Array, "V C N"]
-    """Jacobian, transposed."""
     efc_D: Float[Array, "C N"]
-    """Zero for a row that is not active."""
     efc_aref: Float[Array, "C N"]
 
 
@@ -42,18 +36,15 @@ class Solution(NamedTuple):
     qacc: Float[Array, "V N"]
     efc_force: Float[Array, "C N"]
     niter: Int[Array, " N"]
-    """Newton steps taken, `solver_niter`."""
 
 
 class Context(NamedTuple):
-    """Data updated during each Newton step."""
+    """Data updated during each Newton step; `gauss_grad` is M qacc − qfrc_smooth."""
 
     qacc: Float[Array, "V N"]
     Jaref: Float[Array, "C N"]
     gauss_grad: Float[Array, "V N"]
-    """Gradient of the first term, M qacc − qfrc_smooth."""
     done: Bool[Array, " N"]
-    """True where the env has converged."""
     niter: Int[Array, " N"]
 
 
@@ -118,14 +109,8 @@ def _newton_step(p: Problem, ctx: Context) -> Context:
 def _linesearch(efc_D: Array, ctx: Context, jv: Array, slope: Array, curvature: Array) -> Array:
     """Minimize the cost along a step: safeguarded Newton on its piecewise linear derivative.
 
-    On a CPU the loop ends with the slowest env that is not done. An accelerator unrolls it.
-
-    Args:
-        efc_D: weights of the rows.
-        ctx: the point that the step starts from.
-        jv: change of Jaref per unit of the step.
-        slope: derivative of the first term of the cost at the start.
-        curvature: its second derivative.
+    `jv` is J times the step, `slope` and `curvature` are the derivatives of the first term. On a
+    CPU the loop ends with the slowest env that is not done; an accelerator unrolls it.
     """
     linear, quadratic = efc_D * jv * ctx.Jaref, efc_D * jv * jv
 

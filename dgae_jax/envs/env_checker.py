@@ -1,4 +1,4 @@
-"""What the trainer takes for an environment, checked on shapes before anything is compiled."""
+"""Check of an environment on shapes, before anything is compiled."""
 
 from typing import Any
 
@@ -8,10 +8,14 @@ import jax.numpy as jnp
 from dgae_jax.envs.base import Env
 
 
-def check(env: Env) -> None:
-    """Raise ValueError, with a reason in one line, for an environment whose reset or step is not as `brax.envs.base.Env` has it.
+def check_env(env: Env) -> None:
+    """Check that reset and step are as `brax.envs.base.Env` declares them.
 
-    Observations must be one array with one axis, rewards and `done` numbers, and a step must give back a state as it got it.
+    Observations must be one array with one axis, rewards and `done` real numbers, and a step must
+    preserve the structure of the state.
+
+    Raises:
+        ValueError: with the reason in one line.
     """
     action = jax.ShapeDtypeStruct((_size(env, "action_size"),), jnp.zeros(()).dtype)
     before = _traced("reset", env.reset, jax.random.key(0))
@@ -19,7 +23,8 @@ def check(env: Env) -> None:
     for state, where in ((before, "reset"), (after, "step")):
         if getattr(state.obs, "shape", None) != (_size(env, "observation_size"),):
             raise ValueError(
-                f"the observation of its {where} has shape {_shapes(state.obs)}, and must be one array [observation_size]"
+                f"the observation of its {where} has shape {_shapes(state.obs)},"
+                " and must be one array [observation_size]"
             )
         for name in ("reward", "done"):
             value = getattr(state, name)
@@ -27,7 +32,7 @@ def check(env: Env) -> None:
                 raise ValueError(
                     f"the {name} of its {where} is {value}, and must be a single real number"
                 )
-    _same(before, after)
+    _check_structure(before, after)
 
 
 def _size(env: Env, name: str) -> int:
@@ -40,27 +45,26 @@ def _size(env: Env, name: str) -> int:
 def _traced(name: str, function: Any, *arguments: Any) -> Any:
     try:
         return jax.eval_shape(function, *arguments)
-    except Exception as reason:  # the code is somebody else's
-        why = str(reason).partition("\n")[0]
-        raise ValueError(
-            f"its {name} cannot be compiled by JAX ({type(reason).__name__}: {why})"
-        ) from reason
+    except Exception as reason:  # third-party code may raise anything
+        line = f"{type(reason).__name__}: {str(reason).partition(chr(10))[0]}"
+        raise ValueError(f"its {name} cannot be compiled by JAX ({line})") from reason
 
 
-def _same(before: Any, after: Any) -> None:
-    leaves, others = (
+def _check_structure(before: Any, after: Any) -> None:
+    leaves, new_leaves = (
         dict(jax.tree_util.tree_flatten_with_path(state)[0]) for state in (before, after)
     )
-    for path in leaves | others:
-        one, two = (_shapes(each.get(path)) for each in (leaves, others))
-        if one != two:
+    for path in leaves | new_leaves:
+        old, new = (_shapes(each.get(path)) for each in (leaves, new_leaves))
+        if old != new:
             raise ValueError(
-                f"its step turns state{jax.tree_util.keystr(path)} from {one} into {two}, and must leave it as it is"
+                f"its step turns state{jax.tree_util.keystr(path)} from {old} into {new},"
+                " and must leave it as it is"
             )
 
 
 def _shapes(tree: Any) -> str:
-    """Type and shape of an array as JAX writes them, those of a dictionary's arrays, or that there is nothing."""
+    """Return type and shape of an array, or of the arrays of a dictionary, as JAX writes them."""
     if isinstance(tree, dict):
         return ", ".join(f"{name}: {_shapes(value)}" for name, value in tree.items())
     return "nothing" if tree is None else f"{tree.dtype}{list(tree.shape)}"

@@ -1,0 +1,41 @@
+"""Custom environments, given as objects."""
+
+from typing import Any
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from dgae_jax.envs.base import Env, State, Wrapper, restart
+from dgae_jax.envs.env_checker import check_env
+
+
+class CustomTask(Wrapper):
+    """A custom env with the one thing beyond Brax's contract: the range of its actions."""
+
+    @property
+    def action_range(self) -> tuple[Float[Array, " A"], Float[Array, " A"]]:
+        """The lowest and highest action: the env's own `action_range`, or −1 and 1."""
+        own = getattr(self.env, "action_range", (-1.0, 1.0))
+        low, high = (jnp.broadcast_to(jnp.asarray(each, float), self.action_size) for each in own)
+        return low, high
+
+    def restart(self, state: State, rng: Array, done: Array) -> State:
+        """Restart as `envs.base.restart`."""
+        return restart(self.env, state, rng, done)
+
+
+def with_range(env: Env) -> Env:
+    """Return the env, with a range of its actions if it has none."""
+    return env if hasattr(env, "action_range") else CustomTask(env)
+
+
+def make_custom(env: Any) -> CustomTask:
+    """Check and wrap an env.
+
+    Raises:
+        ValueError: if the trainer cannot take the object.
+    """
+    if not isinstance(env, Env):
+        raise ValueError(f"{type(env).__name__} is not a brax.envs.base.Env")
+    check_env(env)
+    return CustomTask(env)
