@@ -81,7 +81,7 @@ class Delayed(Env):
 
 
 class Coin(Env):
-    """One-step episodes that pay 1 or −1 by a coin nobody sees."""
+    """One-step episodes that pay 1 or −1 by a coin that is not observed."""
 
     observation_size, action_size, backend = 1, 1, "none"
     action_range = (jnp.array([-1.0]), jnp.array([1.0]))

@@ -14,7 +14,7 @@ __all__ = ["Env", "State", "ThirdPartyEnv", "Wrapper", "brax", "has_limit", "res
 
 
 class ThirdPartyEnv(Env):
-    """An env whose sizes and range of actions are known when it is built."""
+    """An env with sizes and a range of actions that are known when it is built."""
 
     observation_size: int = 0  # pyright: ignore[reportIncompatibleMethodOverride, reportAssignmentType]
     action_size: int = 0  # pyright: ignore[reportIncompatibleMethodOverride, reportAssignmentType]

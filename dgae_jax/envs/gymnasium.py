@@ -28,7 +28,7 @@ _NO_EPISODE = (-1, -1)
 
 
 class Position(NamedTuple):
-    """Where a Gymnasium env must be."""
+    """The position of a Gymnasium env in its episode."""
 
     seed: UInt32[Array, " 2"]
     """Seed of its episode, high half and low half."""
@@ -37,7 +37,7 @@ class Position(NamedTuple):
 
 
 class ClipAction(gymnasium.ActionWrapper):
-    """Cast and clip actions to the env's own range, whose bounds may have been rounded outwards."""
+    """Cast and clip actions to the env's own range; its bounds may be rounded outwards."""
 
     def action(self, action: np.ndarray) -> np.ndarray:
         """Return the action as the env takes it."""
@@ -69,7 +69,7 @@ def make_gym_env(name: str, **parameters) -> gymnasium.Env:
 
 
 class _Envs:
-    """As many Gymnasium envs as a call is for; the i-th of a call is the i-th here."""
+    """Gymnasium envs, one for each env of a call, in its order."""
 
     def __init__(self, make: Callable[[], gymnasium.Env], first: gymnasium.Env):
         self.make, self.envs = make, [first]

@@ -53,7 +53,7 @@ class EnvSpec(NamedTuple):
 
     @property
     def versions(self) -> tuple[str, ...]:
-        """Gymnasium's versions whose semantics the task has; empty where it has none."""
+        """Gymnasium's versions of the task; empty where it has none."""
         return tuple(self.eval_envs)
 
     def eval_env(self, version: str | None = None) -> str | None:
@@ -208,7 +208,7 @@ def make_env(
         name: `ant`, `hopper`, `swimmer`, `walker2d`, `brax:NAME`, `playground:NAME` or
             `gymnasium:ID`.
         physics: key of `ENGINES`; by default the first that the task runs on, `jax` for ours.
-        version: Gymnasium's version whose semantics the task has, `v4` (default) or `v5`.
+        version: Gymnasium's version of the task, `v4` (default) or `v5`.
         **task_parameters: those of Gymnasium's constructor, or of the third-party one.
 
     Raises:

@@ -43,11 +43,9 @@ class PhysicsState(NamedTuple):
 
 @runtime_checkable
 class StepFn(Protocol):
-    """Advance a state by one control interval; pure, may be jitted and vmapped."""
+    """Advance by `frame_skip` substeps under the control `ctrl` [U]; may be jitted and vmapped."""
 
-    def __call__(self, state: PhysicsState, ctrl: Array, /) -> PhysicsState:
-        """Return the state after `frame_skip` substeps under the constant control `ctrl` [U]."""
-        ...
+    def __call__(self, state: PhysicsState, ctrl: Array, /) -> PhysicsState: ...
 
 
 class Physics(NamedTuple):
@@ -75,9 +73,7 @@ class Physics(NamedTuple):
 class EngineBuilder(Protocol):
     """Compile a model for an engine; raises ValueError for a model that it does not cover."""
 
-    def __call__(self, spec: mujoco.MjSpec, frame_skip: int, reads: Reads, /) -> Physics:
-        """Return the physics of `spec`, advancing `frame_skip` substeps per control interval."""
-        ...
+    def __call__(self, spec: mujoco.MjSpec, frame_skip: int, reads: Reads, /) -> Physics: ...
 
 
 def body_ids(model: mujoco.MjModel, reads: Reads) -> np.ndarray:
@@ -98,13 +94,9 @@ def body_ids(model: mujoco.MjModel, reads: Reads) -> np.ndarray:
 
 def refuse_hidden_state(model: mujoco.MjModel, name: str) -> None:
     """Raise ValueError for a model with a state that `PhysicsState` does not carry."""
-    sizes = {
-        "activations": "na",
-        "histories": "nhistory",
-        "plugin states": "npluginstate",
-        "user data": "nuserdata",
-    }
-    found = [state for state, size in sizes.items() if getattr(model, size, 0)]
+    states = {"activations": "na", "histories": "nhistory", "user data": "nuserdata"}
+    states["plugin states"] = "npluginstate"
+    found = [state for state, size in states.items() if getattr(model, size, 0)]
     if found:
         raise ValueError(f"physics {name} does not cover {', '.join(found)}, which the model has")
 
@@ -127,11 +119,11 @@ def single_env(batched_step: StepFn) -> StepFn:
             x = jnp.moveaxis(x, 0, -2) if is_batched else jnp.repeat(x[..., None, :], size, -2)
             return x.reshape(*x.shape[:-2], size * envs)
 
+        def split(x):
+            return jnp.moveaxis(x.reshape(*x.shape[:-1], size, envs), -2, 0)
+
         out = many(*jax.tree.map(merge, args, tuple(batched)))
-        split = jax.tree.map(
-            lambda x: jnp.moveaxis(x.reshape(*x.shape[:-1], size, envs), -2, 0), out
-        )
-        return split, jax.tree.map(lambda _: True, out)
+        return jax.tree.map(split, out), jax.tree.map(lambda _: True, out)
 
     def step(state: PhysicsState, ctrl: Array) -> PhysicsState:
         batch = jax.tree.map(lambda x: x[..., None], (state, ctrl))

@@ -2,7 +2,7 @@
 
 `jax.pure_callback` writes the address of the function into the program, so that JAX cannot keep
 the program in its compilation cache, and takes every array through JAX. The structures below are
-those of `xla/ffi/api/c_api.h`, whose versions XLA supports for at least a year.
+those of `xla/ffi/api/c_api.h`; XLA supports a version for at least a year.
 """
 
 import ctypes
@@ -85,9 +85,8 @@ def register(name: str, function: Function) -> None:
     An exception in it ends the program with `jax.errors.JaxRuntimeError`.
 
     Args:
-        name: target for `jax.ffi.ffi_call`. It must stand for the same function in every process;
-            a name that is registered already is left as it is.
-        function: reads and fills arrays.
+        name: target of `jax.ffi.ffi_call`, the same for a function in every process.
+        function: reads and fills arrays; ignored if the name is registered already.
     """
     if name not in _registered:
         _registered[name] = handler = _Handler(functools.partial(_handle, function))

@@ -71,20 +71,14 @@ def require(name: str) -> None:
         raise ValueError(f"unknown physics {name!r}: must be one of {', '.join(ENGINES)}")
     package, extra = ENGINES[name].package, ENGINES[name].extra
     if package is not None and find_spec(package) is None:
+        install = f'pip install "dgae_jax[{extra}]"'
         raise ValueError(
-            f"physics {name} needs the package {package}, which is not installed:"
-            f' pip install "dgae_jax[{extra}]"'
+            f"physics {name} needs the package {package}, which is not installed: {install}"
         )
 
 
 def make_physics(name: str, spec: "mujoco.MjSpec", frame_skip: int, reads: "Reads") -> "Physics":
-    """Build the engine `name` over a model.
-
-    Args:
-        name: key of `ENGINES`.
-        spec: the model.
-        frame_skip: substeps per control interval.
-        reads: the quantities that the task reads besides positions and velocities.
+    """Build the engine `name` over a model, with `frame_skip` substeps per control interval.
 
     Raises:
         ValueError: if the engine is unknown, not installed, or does not cover the model.

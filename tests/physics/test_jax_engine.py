@@ -78,8 +78,8 @@ PLANE, RK4 = "<geom type='plane' size='1 1 1'/>", "integrator='RK4'"
 def model(joint="<joint/>", *, option=RK4, geom="", body="", more=""):
     """One body over a plane."""
     inside = f"{joint}<geom size='.1' {geom}/>{body}"
-    world = f"<worldbody>{PLANE}<body pos='0 0 1'>{inside}</body></worldbody>"
-    return f"<mujoco><option {option}/>{world}{more}</mujoco>"
+    tree = f"<worldbody>{PLANE}<body pos='0 0 1'>{inside}</body></worldbody>"
+    return f"<mujoco><option {option}/>{tree}{more}</mujoco>"
 
 
 @pytest.mark.parametrize(

@@ -77,7 +77,7 @@ def quat_integrate(quat: Float[Array, "4 N"], angle: Float[Array, "3 N"]) -> Flo
 
 
 class Inertia(NamedTuple):
-    """Spatial inertia of B bodies about the center of mass of the tree, in world orientation."""
+    """Spatial inertia of B bodies about the center of mass of the tree, in the world frame."""
 
     rotational: Float[Array, "B 3 3 N"]
     moment: Float[Array, "B 3 N"]

@@ -14,7 +14,7 @@ Constants = np.ndarray | Array
 
 
 class Pose(NamedTuple):
-    """A constant pose in the frame of a joint; frame 0 is the world or the free root."""
+    """A constant pose in the frame of a joint; frame 0 is the world frame or the free root."""
 
     frame: int
     pos: np.ndarray
@@ -55,7 +55,7 @@ class SolverParams(NamedTuple):
 
 
 class Model(NamedTuple):
-    """One tree of J hinges and slides, whose root may be free.
+    """One tree of J hinges and slides, possibly with a free root.
 
     F = J + 1 frames, B moving bodies, V degrees of freedom, U motors.
     """
