@@ -1,4 +1,4 @@
-"""The course of a sweep: launch the runs that are not done, show how far they are, keep results."""
+"""Train a sweep: launch the runs that are not done, show their progress, keep their results."""
 
 import contextlib
 import json
@@ -6,15 +6,18 @@ import os
 import sys
 import time
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 import jax
+import numpy as np
 from rich.console import Console
 
-from dgae_jax.run import terminal
+from dgae_jax.configs.resolved import ResolvedConfig
+from dgae_jax.configs.serial import digest, to_dict
+from dgae_jax.run import checkpoint, files, metrics, terminal
 from dgae_jax.run.options import RunOptions
 from dgae_jax.run.runtime import Signals
-from dgae_jax.study import results
 from dgae_jax.study.launch import Launch
 from dgae_jax.study.sweep import RunSpec, Sweep
 from dgae_jax.study.worker import Job
@@ -27,6 +30,12 @@ PLAIN_EVERY = 30.0
 
 TAIL = 16_384
 """Bytes at the end of a metrics file that hold its last row."""
+
+MAX_POINTS = 200
+"""Most points of a learning curve in the results."""
+
+Rows = list[dict[str, Any]]
+"""Rows of `results.jsonl`, one per seed."""
 
 
 def reproduce(sweep: Sweep, runs: Sequence[RunSpec], options: RunOptions, launch: Launch) -> int:
@@ -45,8 +54,8 @@ def reproduce(sweep: Sweep, runs: Sequence[RunSpec], options: RunOptions, launch
         ConfigError: the launcher cannot start.
     """
     jax.config.update("jax_platforms", "cpu")  # accelerators are left to the runs
-    rows = results.read(sweep)
-    results.write(sweep, rows)
+    rows = read_results(sweep)
+    write_results(sweep, rows)
     jobs = [Job(sweep, run, options) for run in runs if run.name not in rows]
     left = f", {len(jobs)} to train" if jobs else ""
     terminal.say(f"{sweep.path}: {len(runs) - len(jobs)} of {len(runs)} runs are done{left}")
@@ -62,8 +71,8 @@ def reproduce(sweep: Sweep, runs: Sequence[RunSpec], options: RunOptions, launch
                 if reason := _failure(sweep, run, task):
                     progress.note(run, "failed", f"{run.name}: {reason}")
                     continue
-                rows[run.name] = results.rows_of(sweep, run)
-                results.write(sweep, rows)
+                rows[run.name] = rows_of(sweep, run)
+                write_results(sweep, rows)
                 progress.note(run, "done", _summary(run, rows[run.name]))
             progress.show()
             time.sleep(POLL)
@@ -84,14 +93,14 @@ def _failure(sweep: Sweep, run: RunSpec, task: Any) -> str | None:
         code = task.result()
     except Exception as reason:  # of whatever kind the launcher's library raises
         return f"{type(reason).__name__}: {str(reason).partition(chr(10))[0][:200]}"
-    if code == 0 and results.is_done(sweep, run):
+    if code == 0 and is_done(sweep, run):
         return None
     log = sweep.log(run)
     lines = log.read_text(errors="replace").strip().splitlines() if log.is_file() else []
     return f"ended with exit code {code}: {lines[-1][:300] if lines else 'no output'}"
 
 
-def _summary(run: RunSpec, rows: results.Rows) -> str:
+def _summary(run: RunSpec, rows: Rows) -> str:
     means = [row["final"]["return_mean"] for row in rows]
     shown = " ".join("not finite" if mean is None else f"{mean:,.1f}" for mean in means)
     return f"{run.name}: return {shown}, {rows[0]['samples_per_second']:,.0f} steps/s"
@@ -155,3 +164,110 @@ class Progress:
         counts = f"{states.count('done')} done, {states.count('failed')} failed"
         of = f"of {len(self.runs)} runs; {steps:,} of {total:,} steps"
         return f"{counts} {of}, time left {clock}"
+
+
+def is_done(sweep: Sweep, run: RunSpec) -> bool:
+    """Return whether the run has reached its end."""
+    return (sweep.run_dir(run) / "evaluation.json").is_file()
+
+
+def read_results(sweep: Sweep) -> dict[str, Rows]:
+    """Return the rows of the runs that are done, by name.
+
+    A run keeps its rows if its directory is on another machine.
+    """
+    path = sweep.path / "results.jsonl"
+    before: dict[str, Rows] = {}
+    for row in metrics.read(path) if path.is_file() else []:
+        before.setdefault(row.get("cell", ""), []).append(row)
+    found = {}
+    for run in sweep.runs:
+        if is_done(sweep, run):
+            found[run.name] = rows_of(sweep, run)
+        elif run.name in before and not sweep.run_dir(run).exists():
+            found[run.name] = before[run.name]
+    return found
+
+
+def write_results(sweep: Sweep, rows: dict[str, Rows]) -> None:
+    """Write the rows of the runs that are done, in the order of the sweep."""
+    ordered = (row for run in sweep.runs for row in rows.get(run.name, []))
+    files.replace(sweep.path / "results.jsonl", files.json_lines(ordered))
+
+
+def rows_of(sweep: Sweep, run: RunSpec) -> Rows:
+    """Return a row per seed of a run that is done, and write its policy."""
+    run_dir, config = sweep.run_dir(run), run.config
+    _write_policy(run_dir, config, sweep.policy(run))
+    final = json.loads((run_dir / "evaluation.json").read_bytes())
+    manifest = json.loads((run_dir / "manifest.json").read_bytes())
+    trained = metrics.read(run_dir / "metrics.jsonl")
+    evaluated = metrics.EvaluationsFile(run_dir / "evaluations.jsonl").rows
+    steps, seconds = trained[-1]["steps"], trained[-1]["seconds"]
+    rows = []
+    for one in final["seeds"]:
+        evaluations = [row for row in evaluated if row["seed"] == one["seed"]]
+        rows.append(
+            {
+                "cell": run.name,
+                "env": config.env,
+                "env_version": config.env_version,
+                "algo": config.algo,
+                "physics": config.physics,
+                "variant": None if run.label == config.algo else run.label,
+                "seed": one["seed"],
+                "total_steps": config.total_steps,
+                "steps": steps,
+                "hash": digest(config),
+                "final": {
+                    "engine": final["engine"],
+                    "env": final["env"],
+                    "episodes": len(one["returns"]),
+                    **_returns(one),
+                },
+                "best": _best(evaluations),
+                "curve": _curve([row for row in trained if row["seed"] == one["seed"]]),
+                "evaluations": {
+                    name: [row[name] for row in evaluations] for name in ("steps", "return_mean")
+                },
+                "seconds": seconds,
+                "samples_per_second": round(config.num_seeds * steps / seconds, 1),
+                "policy": str(sweep.policy(run).relative_to(sweep.path)),
+                "config": to_dict(config),
+                "versions": manifest["versions"],
+                "machine": {name: manifest[name] for name in ("device", "cores")},
+                "git_revision": manifest["git_revision"],
+                "command": sweep.commands.get(run.name),
+            }
+        )
+    return rows
+
+
+def _returns(evaluation: dict[str, Any]) -> dict[str, Any]:
+    return {name: evaluation.get(name) for name in ("return_mean", "return_std", "returns")}
+
+
+def _best(evaluations: Rows) -> dict[str, Any] | None:
+    """Return the best evaluation, the later of equal ones."""
+    best = max(evaluations, key=lambda row: (row["return_mean"], row["steps"]), default=None)
+    return best and {"steps": best["steps"], **_returns(best)}
+
+
+def _curve(rows: Rows) -> dict[str, list]:
+    """Average episode returns over equal stretches; null where no episode has ended yet."""
+    steps = [row["steps"] for row in rows]
+    returns = np.array([row["episode_return"] for row in rows], float)
+    parts = [part for part in np.array_split(np.arange(len(rows)), MAX_POINTS) if len(part)]
+    means = [returns[part][np.isfinite(returns[part])] for part in parts]
+    return {
+        "steps": [steps[part[-1]] for part in parts],
+        "return": [round(float(found.mean()), 3) if len(found) else None for found in means],
+    }
+
+
+def _write_policy(run_dir: Path, config: ResolvedConfig, path: Path) -> None:
+    """Write the final policy unless the file is newer than the end of the run."""
+    if path.is_file() and path.stat().st_mtime >= (run_dir / "evaluation.json").stat().st_mtime:
+        return
+    found = checkpoint.load_networks(run_dir, config, "latest")
+    checkpoint.save_networks(path, config, found, checkpoint.reward_std(found.path, config))

@@ -15,13 +15,13 @@ import sys
 import time
 import warnings
 from dataclasses import replace
-from multiprocessing.process import BaseProcess
 from typing import Any
 
 import numpy as np
 import optuna
 import sqlalchemy.exc
 from optuna.distributions import CategoricalDistribution, IntDistribution
+from optuna.exceptions import ExperimentalWarning
 from optuna.storages import RDBStorage, RetryHeartbeatStaleTrialCallback
 from optuna.study import MaxTrialsCallback, Study
 from optuna.trial import FrozenTrial, Trial, TrialState
@@ -47,6 +47,8 @@ MAX_RETRIES = 5
 LOCK_TIMEOUT = 60
 """Longest wait for another process that writes to the same SQLite file [s]."""
 
+SPAWN = multiprocessing.get_context("spawn")
+
 POLL = 0.5
 """Time between looks at the study and the workers [s]."""
 
@@ -66,7 +68,7 @@ def tune(tuning: Tuning) -> int:
     try:
         (tuning.directory / "trials").mkdir(parents=True, exist_ok=True)
         with warnings.catch_warnings(), Signals() as signals:
-            _ignore_experimental()
+            warnings.simplefilter("ignore", ExperimentalWarning)
             study = open_study(tuning)
             _run_workers(tuning, study, signals)
             count = _count(study, FINISHED)
@@ -120,10 +122,6 @@ def open_study(tuning: Tuning, worker: int = 0) -> Study:
     return study
 
 
-def _ignore_experimental() -> None:
-    warnings.simplefilter("ignore", optuna.exceptions.ExperimentalWarning)
-
-
 def _retry(study: Study, trial: FrozenTrial) -> None:
     """Enqueue a trial again, with what it has reported."""
     RetryHeartbeatStaleTrialCallback(MAX_RETRIES, inherit_intermediate_values=True)(study, trial)
@@ -153,7 +151,12 @@ def _run_workers(tuning: Tuning, study: Study, signals: Signals) -> None:
     while not signals.received and _count(study, FINISHED) < tuning.trials:
         optuna.storages.fail_stale_trials(study)
         missing = tuning.trials - _count(study, UNDER_WAY)
-        workers = [start_worker(tuning, n) for n in range(min(missing, tuning.workers))]
+        workers = [
+            SPAWN.Process(target=run_worker, args=(tuning, number))
+            for number in range(min(missing, tuning.workers))
+        ]
+        for worker in workers:
+            worker.start()
         is_told = False
         while running := [worker for worker in workers if worker.is_alive()]:
             if signals.received and not is_told:
@@ -185,15 +188,8 @@ def _say_finished(study: Study, said: set[int]) -> None:
             terminal.say(f"trial {trial.number}: {trial.state.name.lower()}, {value} ({settings})")
 
 
-def start_worker(tuning: Tuning, number: int) -> BaseProcess:
-    """Start a process of its own, on every `tuning.workers`-th core, that trains trials."""
-    process = multiprocessing.get_context("spawn").Process(target=_work, args=(tuning, number))
-    process.start()
-    return process
-
-
-def _work(tuning: Tuning, number: int) -> None:
-    """Train trials, and end the process."""
+def run_worker(tuning: Tuning, number: int) -> None:
+    """Train trials in this process, on every `tuning.workers`-th core, and end it."""
     os.setpgid(0, 0)  # Ctrl-C reaches the first process only, which passes it on once
     signal.signal(signal.SIGINT, signal.SIG_DFL)  # outside of a run there is nothing to save
     if hasattr(os, "sched_getaffinity"):
@@ -210,12 +206,12 @@ def _work(tuning: Tuning, number: int) -> None:
 
 def work(tuning: Tuning, number: int = 0) -> int:
     """Train trials until enough are under way; return the exit code."""
-    _ignore_experimental()
+    warnings.simplefilter("ignore", ExperimentalWarning)
     warnings.filterwarnings("ignore", "The reported value is ignored")  # by a trial that resumes
-    options = replace(tuning.options, num_processes=1)
+    config = replace(tuning.config, num_seeds=tuning.seeds)
     try:
         # a fault of the machine must not count against the settings of a trial
-        training.prepare(replace(tuning.config, num_seeds=tuning.seeds), options)
+        training.prepare(config, replace(tuning.options, num_processes=1))
         study = open_study(tuning, 1 + number)
         enough = MaxTrialsCallback(tuning.trials, UNDER_WAY)
         study.optimize(lambda trial: _train(tuning, study, trial), callbacks=[enough])

@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from dgae_jax.configs.config import ConfigError
+from dgae_jax.configs.resolved import ResolvedConfig
 from dgae_jax.run import terminal
 from dgae_jax.run.directory import InUseError
 from dgae_jax.run.options import RunOptions
@@ -36,15 +37,9 @@ class Job(NamedTuple):
 
 
 def execute(job: Job, cores: Sequence[int] = (), lifeline: int = subprocess.PIPE) -> int:
-    """Train a run in a process of its own, which writes to the run's log.
+    """Train a run in a process of its own, on some cores, and return its exit code.
 
-    Args:
-        job: the run.
-        cores: CPU cores of the process; empty for all.
-        lifeline: its standard input. When the other end is closed the run stops.
-
-    Returns:
-        The exit code of the run.
+    The run stops when the other end of `lifeline`, the standard input of the process, is closed.
     """
     options = json.dumps(dataclasses.asdict(job.options))
     words = [str(job.sweep.path.absolute()), job.run.name, options, *map(str, cores)]
@@ -70,7 +65,7 @@ def main() -> int:
     sweep = sweeps.read(Path(path))
     run = next(each for each in sweep.runs if each.name == name)
     where = {"run_dir": sweep.run_dir(run), "resume_or_start": True, "num_processes": 1}
-    return _train(run, RunOptions(**{**json.loads(options), **where}))
+    return _train(run.config, RunOptions(**{**json.loads(options), **where}))
 
 
 def _stop_when_abandoned() -> None:
@@ -79,13 +74,13 @@ def _stop_when_abandoned() -> None:
     os.kill(os.getpid(), signal.SIGTERM)
 
 
-def _train(run: RunSpec, options: RunOptions) -> int:
+def _train(config: ResolvedConfig, options: RunOptions) -> int:
     from dgae_jax.run import training  # after the cores are set
 
     deadline = time.monotonic() + IN_USE_TIMEOUT
     while True:
         try:
-            return training.train_command(run.config, options)
+            return training.train_command(config, options)
         except ConfigError as mistake:
             if not isinstance(mistake, InUseError) or time.monotonic() > deadline:
                 terminal.warn(f"error: {mistake}")

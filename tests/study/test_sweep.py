@@ -9,7 +9,7 @@ from dgae_jax.configs.config import ConfigError
 from dgae_jax.configs.resolved import resolve
 from dgae_jax.configs.serial import differences, from_dict
 from dgae_jax.run import metrics
-from dgae_jax.study import results
+from dgae_jax.study import reproduce
 from dgae_jax.study import sweep as sweeps
 from dgae_jax.study.variants import VARIANTS, variants
 from tests.helpers import ROOT
@@ -122,7 +122,7 @@ def test_a_sweep_that_cannot_be_read_is_refused(tmp_path, change, message):
 @pytest.mark.parametrize("path", COMMITTED, ids=lambda path: path.name)
 def test_a_committed_sweep_is_read_and_its_runs_are_done(path):
     sweep = sweeps.read(path)
-    rows = results.read(sweep)
+    rows = reproduce.read_results(sweep)
     committed = metrics.read(path / "results.jsonl")
     assert rows.keys() == {row["cell"] for row in committed}
     for run in sweep.runs:
@@ -135,8 +135,8 @@ def test_a_long_curve_is_averaged_to_two_hundred_points():
     rows = [
         {"steps": 10 * (i + 1), "episode_return": float(i) if i > 2 else None} for i in range(400)
     ]
-    curve = results._curve(rows)
+    curve = reproduce._curve(rows)
     assert (curve["steps"][:3], curve["steps"][-1]) == ([20, 40, 60], 4000)
     assert curve["return"][:4] == [None, 3.0, 4.5, 6.5]
     assert len(curve["return"]) == 200
-    assert results._curve(rows[3:5]) == {"steps": [40, 50], "return": [3.0, 4.0]}
+    assert reproduce._curve(rows[3:5]) == {"steps": [40, 50], "return": [3.0, 4.0]}

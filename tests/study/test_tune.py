@@ -18,7 +18,7 @@ from dgae_jax.run.training import RunError
 from dgae_jax.study import outcome, tune
 from dgae_jax.study.outcome import FINISHED
 from dgae_jax.study.search import Tuning, space_of
-from dgae_jax.study.tune import open_study, start_worker, work
+from dgae_jax.study.tune import SPAWN, open_study, run_worker, work
 from tests import studies
 from tests.helpers import TINY
 from tests.runs import QUIET, small
@@ -204,7 +204,9 @@ def test_a_killed_process_is_made_up_for(tmp_path):
     config = dataclasses.replace(small(), total_steps=64 * 400)
     ours = tuning(tmp_path / "study", trials=3, workers=2, config=config)
     study = opened(ours)
-    processes = [start_worker(ours, number) for number in (0, 1)]
+    processes = [SPAWN.Process(target=run_worker, args=(ours, number)) for number in (0, 1)]
+    for process in processes:
+        process.start()
     studies.wait_for(lambda: len(list(ours.directory.glob("trials/*/metrics.jsonl"))) == 2)
     processes[0].kill()
     processes[1].join(240)
