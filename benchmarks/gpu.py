@@ -18,7 +18,7 @@ import numpy as np
 import physics
 
 import dgae_jax as dg
-from dgae_jax.cli.arguments import parse
+from dgae_jax.cli import parse
 from dgae_jax.configs.resolved import resolve
 from dgae_jax.envs.registry import TASKS
 from dgae_jax.learn.build import make_task, make_trainer, seed_keys
@@ -125,7 +125,7 @@ def measurements(arguments: Arguments) -> Iterator[tuple[str, Any]]:
 
 def main() -> None:
     """One line per measurement, and the file."""
-    arguments = parse(Arguments, "What an accelerator makes of it.")
+    arguments = parse.arguments(Arguments, description="What an accelerator makes of it.")
     jax.config.update("jax_enable_compilation_cache", False)
     device, began = jax.devices()[0], time.monotonic()
     found: dict[str, Any] = {

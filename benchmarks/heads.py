@@ -20,7 +20,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 import dgae_jax as dg
-from dgae_jax.cli.arguments import parse
+from dgae_jax.cli import parse
 from dgae_jax.configs.parts import CRITICS, TARGETS, Part
 from dgae_jax.configs.resolved import resolve
 from dgae_jax.learn.critics import SR_LAMBDA, quantile
@@ -150,7 +150,7 @@ def row(task: str, critic: str, seed: int, total_steps: int) -> dict:
 
 def main() -> None:
     """Print a line for each run."""
-    arguments = parse(Arguments, "Critics whose quantiles cannot cross.")
+    arguments = parse.arguments(Arguments, description="Critics whose quantiles cannot cross.")
     file = arguments.json
     rows = json.loads(file.read_text())["rows"] if file and file.exists() else []
     known = {

@@ -24,7 +24,7 @@ import numpy as np
 from mujoco.batch import Batch
 
 import dgae_jax as dg
-from dgae_jax.cli.arguments import parse
+from dgae_jax.cli import parse
 from dgae_jax.envs.registry import TASKS
 from dgae_jax.learn import devices
 from dgae_jax.learn.parallel import COMPILER_OPTIONS
@@ -232,7 +232,9 @@ def policy_of(run_dir: Path) -> tuple[str, Callable[[np.ndarray], np.ndarray]]:
 
 def main() -> None:
     """Print both tables."""
-    arguments = parse(Arguments, "Speed and exactness of the physics engines.")
+    arguments = parse.arguments(
+        Arguments, description="Speed and exactness of the physics engines."
+    )
     jax.config.update("jax_enable_compilation_cache", False)
     jax.config.update("jax_platforms", {"cpu": "cpu", "gpu": "cuda"}[arguments.device])
     jax.config.update("jax_enable_x64", arguments.x64)

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-from dgae_jax.cli.arguments import parse
+from dgae_jax.cli import parse
 from dgae_jax.report import figures
 from dgae_jax.report.results import Row, read
 from dgae_jax.run import checkpoint, directory, metrics, runtime
@@ -57,7 +57,9 @@ def row(study: Path, cell: Row) -> dict:
 
 def main() -> None:
     """Print a line for each policy."""
-    arguments = parse(Arguments, "Value distributions that are fitted to finished policies.")
+    arguments = parse.arguments(
+        Arguments, description="Value distributions that are fitted to finished policies."
+    )
     file, known, shown = arguments.json, {}, {}
     if file and file.exists():
         known = {each["checkpoint"]: each for each in json.loads(file.read_text())["rows"]}

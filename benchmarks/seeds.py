@@ -15,7 +15,7 @@ from pathlib import Path
 
 from throughput import iteration, setting
 
-from dgae_jax.cli.arguments import parse
+from dgae_jax.cli import parse
 from dgae_jax.configs.config import Config
 from dgae_jax.physics.registry import cores
 from dgae_jax.run import runtime
@@ -49,7 +49,7 @@ def rate(config: Config, seconds: float, core: int | None = None) -> float:
 def main() -> None:
     """Print a line for each algorithm and engine."""
     arguments, context = (
-        parse(Arguments, "Seeds side by side."),
+        parse.arguments(Arguments, description="Seeds side by side."),
         multiprocessing.get_context("spawn"),
     )
     rows = []

@@ -14,7 +14,7 @@ import time
 from dataclasses import dataclass
 from pathlib import Path
 
-from dgae_jax.cli.arguments import parse
+from dgae_jax.cli import parse
 from dgae_jax.run import files, metrics
 
 TRAIN = Path(__file__).parent.parent / "experiments" / "train.py"
@@ -46,7 +46,7 @@ def measured(pid: int) -> dict[str, float]:
 
 
 def main() -> int:
-    arguments = parse(Arguments, "Watch the memory of a long run.")
+    arguments = parse.arguments(Arguments, description="Watch the memory of a long run.")
     argv = [
         "--run-dir",
         str(arguments.run_dir),

@@ -31,7 +31,7 @@ from table import PEER_OF, rival_of
 from turns import counted
 
 import dgae_jax as dg
-from dgae_jax.cli.arguments import parse
+from dgae_jax.cli import parse
 from dgae_jax.configs.config import Config
 from dgae_jax.configs.resolved import resolve
 from dgae_jax.learn import devices
@@ -268,7 +268,7 @@ def settings(arguments: Arguments) -> Iterator[Config]:
 
 def main() -> None:
     """Print the peers, then a row of ours each, over the fastest peer and over the roofline."""
-    arguments = parse(Arguments, "Training throughput.")
+    arguments = parse.arguments(Arguments, description="Training throughput.")
     others = []
     if arguments.peers:
         for task, width in itertools.product(arguments.tasks, arguments.widths):

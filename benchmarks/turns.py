@@ -18,7 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import dgae_jax as dg
-from dgae_jax.cli.arguments import parse
+from dgae_jax.cli import parse
 from dgae_jax.configs.resolved import resolve
 from dgae_jax.envs.registry import TASKS
 from dgae_jax.learn.types import Batch, TrainableState
@@ -192,7 +192,7 @@ def of_update(algo: str) -> list[list[int]]:
 
 def main() -> None:
     """Print both tables, in Markdown."""
-    arguments = parse(Arguments, "Turns of loops in a step and in an update.")
+    arguments = parse.arguments(Arguments, description="Turns of loops in a step and in an update.")
     print(
         f"| one environment step of {arguments.worlds:,} worlds, `jax` | known length | `while` | together |\n|---|---|---|---|"
     )

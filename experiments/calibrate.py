@@ -2,7 +2,7 @@
 
 import sys
 
-from dgae_jax.cli.calibrate import main
+from dgae_jax.cli.evaluate import calibrate
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(calibrate())

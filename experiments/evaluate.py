@@ -2,7 +2,7 @@
 
 import sys
 
-from dgae_jax.cli.evaluate import main
+from dgae_jax.cli.evaluate import evaluate
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(evaluate())

@@ -2,7 +2,7 @@
 
 import sys
 
-from dgae_jax.cli.export import main
+from dgae_jax.cli.export import export
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(export())

@@ -2,7 +2,7 @@
 
 import sys
 
-from dgae_jax.cli.figures import main
+from dgae_jax.cli.render import figures
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(figures())

@@ -2,7 +2,7 @@
 
 import sys
 
-from dgae_jax.cli.refit import main
+from dgae_jax.cli.evaluate import refit
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(refit())

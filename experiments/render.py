@@ -2,7 +2,7 @@
 
 import sys
 
-from dgae_jax.cli.render import main
+from dgae_jax.cli.render import render
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(render())

@@ -2,7 +2,7 @@
 
 import sys
 
-from dgae_jax.cli.report import main
+from dgae_jax.cli.report import report
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(report())

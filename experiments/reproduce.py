@@ -2,7 +2,7 @@
 
 import sys
 
-from dgae_jax.cli.reproduce import main
+from dgae_jax.cli.reproduce import reproduce
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(reproduce())

@@ -2,7 +2,7 @@
 
 import sys
 
-from dgae_jax.cli.train import main
+from dgae_jax.cli.train import train
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(train())

@@ -2,7 +2,7 @@
 
 import sys
 
-from dgae_jax.cli.tune import main
+from dgae_jax.cli.tune import tune
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(tune())

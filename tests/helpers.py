@@ -2,7 +2,6 @@
 
 import dataclasses
 import hashlib
-import importlib
 import json
 import tempfile
 from pathlib import Path
@@ -11,6 +10,7 @@ import jax
 import jax.numpy as jnp
 
 import dgae_jax as dg
+from dgae_jax.cli import main
 from dgae_jax.run import checkpoint
 
 ROOT = Path(__file__).parent.parent
@@ -40,8 +40,8 @@ TINY = ["--physics", "native", "--num-envs", "4", "--num-steps", "16", "--policy
 
 
 def command(name):
-    """The `main` of a command line."""
-    return importlib.import_module(f"dgae_jax.cli.{name}").main
+    """The function of a command."""
+    return main.command(name)
 
 
 def signed(arrays):

@@ -1,95 +1,88 @@
-"""The console command: `dgae COMMAND …` is `python experiments/COMMAND.py …`."""
+"""The program `dgae`: its commands by name, help, versions and completion."""
 
+import inspect
 import platform
 import sys
-from difflib import get_close_matches
+from collections.abc import Callable
 from importlib import import_module, metadata
+from typing import Annotated, Any, Union
+
+import tyro
 
 import dgae_jax
+from dgae_jax.cli import parse
+from dgae_jax.configs.config import invalid
 from dgae_jax.run import terminal
 
 COMMANDS = {
-    "train": "train a policy and write a run directory",
-    "evaluate": "evaluate the policy of a run directory, or of a file",
-    "calibrate": "compare the critic of run directories with the returns that came",
-    "refit": "fit a value distribution to a policy that is held fixed",
-    "reproduce": "train all of a study: tasks, algorithms and seeds",
-    "report": "figures, tables and one page from the results of studies",
-    "tune": "search for the settings with the highest return",
-    "render": "make a film of the policy of a run directory",
-    "export": "take a policy out, as NumPy, ONNX or an agent of Gymnasium",
-    "figures": "draw the robots and the transport of mass",
+    "train": "train",
+    "evaluate": "evaluate",
+    "calibrate": "evaluate",
+    "refit": "evaluate",
+    "reproduce": "reproduce",
+    "report": "report",
+    "tune": "tune",
+    "render": "render",
+    "export": "export",
+    "figures": "render",
 }
-"""Each is a module of this room with a `main`."""
+"""Each command is a function of its name in a module of this room."""
 
-USAGE = """usage: dgae COMMAND [flags]
+DESCRIPTION = """Policy gradients with value distributions, end to end in JAX.
 
-Policy gradients with value distributions, end to end in JAX.
+dgae COMMAND --help lists the flags of a command.
+dgae --version prints the versions that results depend on.
+dgae --completion bash|zsh|fish prints a script for the shell.
 
-commands:
-{commands}
-
-flags:
-  -h, --help         this; dgae COMMAND --help lists the flags of a command
-  --version          the versions of this package and of those that it stands on
-  --completion SHELL
-                     a script that completes commands, flags and names in bash,
-                     zsh or fish: source <(dgae --completion bash)
-
-exit codes: 0 done; 1 broke down; 2 bad input, one line on stderr;
+exit codes: 0 done; 1 diverged or could not write; 2 bad input;
             129, 130 or 143 stopped by SIGHUP, SIGINT or SIGTERM
 
-examples:
-{examples}"""
+Examples:
+  dgae train --env hopper --algo dppo --run-dir runs/first
+  dgae evaluate runs/first --episodes 100
+  dgae reproduce studies/small --envs hopper --algos ppo dppo --scale 0.1"""
 
-EXAMPLES = (
-    "dgae train --env hopper --algo dppo --run-dir runs/first",
-    "dgae evaluate runs/first --episodes 100",
-    "dgae reproduce studies/small --envs hopper --algos ppo dppo --scale 0.1",
-)
+SHELLS = ("bash", "zsh", "fish")
 
 LIBRARIES = ("jax", "mujoco", "mujoco-mjx", "brax", "gymnasium")
 """What results depend on most."""
 
 
+def command(name: str) -> Callable[[], int]:
+    """Return the command of that name."""
+    return getattr(import_module(f"dgae_jax.cli.{COMMANDS[name]}"), name)
+
+
 def main() -> int:
-    """Run one command; 2 for an unknown name."""
+    """Run one command."""
     terminal.prepare()
-    words = sys.argv[1:]
-    name = words[0] if words else "--help"
-    if name in ("-h", "--help"):
-        terminal.say(_usage())
-        return 0
-    if name == "--version":
+    words = sys.argv[1:] or ["--help"]
+    name, _, value = words[0].partition("=")
+    if words[0] in COMMANDS:
+        sys.argv = [f"dgae {name}", *words[1:]]
+        return command(name)()
+    if words[0] == "--version":
         versions = ", ".join(f"{library} {metadata.version(library)}" for library in LIBRARIES)
-        terminal.say(
-            f"dgae_jax {dgae_jax.__version__}\nPython {platform.python_version()}, {versions}"
-        )
+        terminal.say(f"dgae_jax {dgae_jax.__version__}")
+        terminal.say(f"Python {platform.python_version()}, {versions}")
         return 0
-    if name.partition("=")[0] == "--completion":
-        return _completion(name.partition("=")[2] or "".join(words[1:2]))
-    if name not in COMMANDS:
-        near = get_close_matches(name, COMMANDS, n=1)
-        meant = f"; perhaps {near[0]}" if near else ""
-        terminal.warn(f"error: {ascii(name)[1:-1]}: must be one of {', '.join(COMMANDS)}{meant}")
-        return 2
-    sys.argv = [f"dgae {name}", *words[1:]]
-    return import_module(f"dgae_jax.cli.{name}").main()
-
-
-def _usage() -> str:
-    commands = "\n".join(f"  {name:10s} {purpose}" for name, purpose in COMMANDS.items())
-    return USAGE.format(commands=commands, examples="\n".join(f"  {line}" for line in EXAMPLES))
-
-
-def _completion(shell: str) -> int:
-    from dgae_jax.cli import arguments, completion
-
-    try:
-        terminal.say(completion.script(shell, COMMANDS).rstrip("\n"))
-    except ValueError as mistake:
-        arguments.fail(mistake)
+    if name == "--completion":
+        shell = value or "".join(words[1:2])
+        if shell not in SHELLS:
+            parse.fail(invalid("completion", shell or "nothing", f"one of {', '.join(SHELLS)}"))
+        words = ["--tyro-print-completion", shell]
+    parse.arguments(_any_command(), words, description=DESCRIPTION, prog="dgae")
     return 0
+
+
+def _any_command() -> Any:
+    """Return the type of which tyro makes the help, the completion and the message of a mistake."""
+    kinds = []
+    for name in COMMANDS:
+        flags = command(name).arguments  # pyright: ignore[reportFunctionMemberAccess]
+        purpose = (inspect.getdoc(flags) or "").partition("\n")[0]
+        kinds.append(Annotated[flags, tyro.conf.subcommand(name, description=purpose)])
+    return Union[tuple(kinds)]  # noqa: UP007
 
 
 if __name__ == "__main__":

@@ -1,189 +1,159 @@
-"""Make a film of a trained run: dgae render RUN_DIR --episodes 2
+"""Make a video of a trained run, `dgae render RUN_DIR`, and draw figures, `dgae figures`."""
 
-Flags are checked, and the OpenGL to draw with is chosen, before the rest is imported: JAX and MuJoCo take seconds to load.
-"""
-
-import sys
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
 import tyro
 
-from dgae_jax.cli.arguments import fail, parse, stopped
-from dgae_jax.cli.source import check_file, check_index
+from dgae_jax.cli import parse
+from dgae_jax.cli.evaluate import Choice
 from dgae_jax.configs.config import ConfigError, invalid
 from dgae_jax.configs.resolved import ResolvedConfig
 from dgae_jax.envs.registry import TASKS, spec_of
 from dgae_jax.export import encoding, gl
-from dgae_jax.run import directory, files, terminal
-from dgae_jax.run.options import RunOptions
+from dgae_jax.run import files, terminal
 
-PURPOSE = "Make a film of the deterministic policy of a trained run, in Gymnasium."
-
-EXAMPLES = (
-    "dgae render runs/walker",
-    "dgae render runs/walker --compare runs/hopper --seconds 5 --format gif",
-    "dgae render runs/walker --during --out walker.mp4 --format mp4",
-)
+MAX_SECONDS = 600.0
+"""Longest part of an episode [s]."""
 
 
-@dataclass(frozen=True)
-class Arguments:
-    """What to film, and how."""
+@dataclass(frozen=True, kw_only=True)
+class RenderArguments(Choice):
+    """Make a video of the deterministic policy of a trained run, in Gymnasium.
+
+    Examples:
+      dgae render runs/walker
+      dgae render runs/walker --compare runs/hopper --seconds 5 --format gif
+      dgae render runs/walker --during --out walker.mp4 --format mp4
+    """
 
     run_dir: tyro.conf.Positional[Path]
     """Directory of the run, or the file of dgae refit [path]."""
     compare: tuple[Path, ...] = ()
-    """Further runs from the same initial states, shown beside it, from four on in a square [paths]."""
-    checkpoint: Literal["latest", "best"] | None = None
-    """latest, or best: of the evaluations while it trained; by default latest."""
+    """Further runs from the same initial states, shown beside it, from four on in a square
+    [paths]."""
     during: bool = False
-    """The policy at each checkpoint that the run keeps, one after the other, so that one sees it learn."""
-    index: int = 0
-    """Which of the seeds that were trained side by side, from 0."""
+    """Show the policy at each checkpoint that the run keeps, one after the other."""
     episodes: int = 1
     """Episodes, one after the other [episodes]."""
-    seed: int = 0
-    """Seed of the initial states, the same as those of an evaluation [1]."""
     seconds: float = 10.0
-    """Longest part of an episode that is shown, in the robot's own time [s]."""
+    """Longest part of an episode that is shown, in simulated time [s]."""
     format: Literal["mp4", "gif", "both"] = "both"
     """Files to write."""
     width: int = 480
     """Width of the picture of each robot, even [pixels]."""
     height: int = 360
-    """Height of the picture of each robot without the strip below it, even [pixels]."""
+    """Height of the picture of each robot without the overlay below it, even [pixels]."""
     fps: int = 25
     """Frames per second of the MP4; a GIF has at most half of the default [1/s]."""
     out: Path | None = None
-    """File to write, to whose name .mp4 and .gif are added; by default video in the run directory, video-best,
-    video-during or video-compare [path]."""
-    cache_dir: str = RunOptions.cache_dir
-    """Where compiled programs are kept between runs; none disables [path]."""
+    """File to write, to whose name .mp4 and .gif are added; by default video in the run directory,
+    video-best, video-during or video-compare [path]."""
+
+    @property
+    def sources(self) -> list[Path]:
+        """All runs that are shown."""
+        return [self.run_dir, *self.compare]
+
+    @property
+    def stem(self) -> Path:
+        """The file to write, without its ending."""
+        if self.out is not None:
+            return self.out.with_suffix("") if self.out.suffix in (".mp4", ".gif") else self.out
+        is_best = self.checkpoint == "best"
+        kinds = {"during": self.during, "compare": bool(self.compare), "best": is_best}
+        name = "-".join(["video", *(kind for kind, is_so in kinds.items() if is_so)])
+        return files.beside(self.run_dir, name)
 
 
-WHOLE = {
-    "episodes": (1, 1_000, 1),
-    "seed": (0, 2**31 - 1, 1),
-    "width": (160, 1920, 2),
-    "height": (120, 1080, 2),
-    "fps": (1, 100, 1),
-}
-"""Whole numbers: from, to, and what they are a multiple of."""
-
-LONGEST = 600.0
-"""Seconds of an episode."""
-
-
-def main() -> int:
-    """Film one run or several; 0 done, 2 bad input or no OpenGL, 130 stopped by SIGINT."""
-    terminal.prepare()
-    try:
-        arguments = parse(Arguments, PURPOSE, examples=EXAMPLES)
-        _check(arguments)
-        sources = (arguments.run_dir, *arguments.compare)
-        if any(path.is_file() for path in sources):
-            gl.choose()  # to read the configuration in a policy's file imports MuJoCo
-        configs = [_config(path, arguments.index) for path in sources]
-        _check_out(arguments)
-        gl.choose()
-        return _render(arguments, configs)
-    except ConfigError as mistake:
-        fail(mistake)
-    except KeyboardInterrupt:
-        return stopped("stopped by SIGINT, nothing written")
-
-
-def _check(arguments: Arguments) -> None:
-    """Raise ConfigError for the first argument that is invalid."""
-    for name, (low, high, multiple) in WHOLE.items():
-        value = getattr(arguments, name)
-        if not low <= value <= high or value % multiple:
-            kind = "an even" if multiple == 2 else "a whole"
-            raise invalid(name, value, f"{kind} number from {low:,} to {high:,}")
-    if not 0 < arguments.seconds <= LONGEST:
-        raise invalid("seconds", arguments.seconds, f"a number above 0, up to {LONGEST:g}")
-    for other in ("compare", "checkpoint"):
-        if arguments.during and getattr(arguments, other):
-            raise invalid(
-                other,
-                getattr(arguments, other),
-                "left out with --during, which shows every checkpoint of one run",
-            )
-    if arguments.during and arguments.run_dir.is_file():
-        raise ConfigError(f"--during: must be left out with {arguments.run_dir}, a single policy")
+def _check(args: RenderArguments) -> list[ResolvedConfig]:
+    """Return the configurations of the runs; raise ConfigError for the first mistake."""
+    parse.check(args, episodes=(1, 1000), width=(160, 1920), height=(120, 1080), fps=(1, 100))
+    for name in ("width", "height"):
+        if getattr(args, name) % 2:
+            raise invalid(name, getattr(args, name), "an even number")
+    if not 0 < args.seconds <= MAX_SECONDS:
+        raise invalid("seconds", args.seconds, f"a number above 0, up to {MAX_SECONDS:g}")
+    if args.during and args.compare:
+        raise invalid("compare", args.compare, "left out with --during, which shows one run")
+    if args.during and args.checkpoint == "best":
+        raise invalid("checkpoint", "best", "left out with --during, which shows every checkpoint")
+    if args.during and args.run_dir.is_file():
+        raise ConfigError(f"--during: must be left out with {args.run_dir}, a single policy")
     encoding.check_installed()
+    if any(path.is_file() for path in args.sources):
+        gl.choose()  # reading a policy's file imports MuJoCo
+    configs = [args.config(path) for path in args.sources]
+    for path, config in zip(args.sources, configs, strict=True):
+        if not spec_of(config.env).eval_envs:
+            raise ConfigError(f"{path}: must be a run of {', '.join(TASKS)}, not {config.env}")
+    for kind in encoding.FORMATS[args.format]:
+        parse.check_file(args.stem.with_name(f"{args.stem.name}.{kind}"))
+    return configs
 
 
-def _check_out(arguments: Arguments) -> None:
-    stem = _stem(arguments)
-    for kind in encoding.FORMATS[arguments.format]:
-        check_file(stem.with_name(f"{stem.name}.{kind}"))
+@parse.command(RenderArguments)
+def render(args: RenderArguments) -> None:
+    """Make a video of one run or several."""
+    configs = _check(args)
+    gl.choose()
+    from dgae_jax.export import video
 
-
-def _config(path: Path, index: int) -> ResolvedConfig:
-    """The configuration of a run that Gymnasium can play."""
-    config = directory.config_of(path)
-    if not spec_of(config.env).eval_envs:
-        raise ConfigError(
-            f"{path}: must be a run of {', '.join(TASKS)}, which can be filmed; it is one of {config.env}"
-        )
-    check_index(index, config, path)
-    return config
-
-
-def _stem(arguments: Arguments) -> Path:
-    """The file to write, without its ending."""
-    if arguments.out is None:
-        kinds = {
-            "during": arguments.during,
-            "compare": arguments.compare,
-            "best": arguments.checkpoint == "best",
-        }
-        return files.beside(
-            arguments.run_dir,
-            "-".join(["video", *(kind for kind, is_so in kinds.items() if is_so)]),
-        )
-    out = arguments.out
-    return out.with_suffix("") if out.suffix in (".mp4", ".gif") else out
+    parse.use_one_device(configs[0], args.cache_dir)
+    clip = video.Clip(args.episodes, args.seed, args.seconds)
+    if args.during:
+        scenes = video.of_checkpoints(args.run_dir, configs[0], args.index, clip)
+    else:
+        runs = list(zip(_titles(args.sources), args.sources, configs, strict=True))
+        scenes = video.of_runs(runs, args.checkpoint, args.index, clip)
+    with terminal.Reporter() as reporter:
+        frames = video.frames(scenes, args.width, args.height, args.fps, reporter.watch)
+        with parse.writing(args.stem):
+            written = encoding.write(frames, args.stem, encoding.FORMATS[args.format], args.fps)
+    for path in written:
+        terminal.say(f"written to {path} ({path.stat().st_size / 1e6:.1f} MB)")
 
 
 def _titles(paths: list[Path]) -> list[str]:
-    """The names of the runs; their whole paths where two names are the same."""
+    """Return the names of the runs; their whole paths where two names are the same."""
     names = [path.resolve().name for path in paths]
     return names if len(set(names)) == len(names) else [str(path) for path in paths]
 
 
-def _render(arguments: Arguments, configs: list[ResolvedConfig]) -> int:
-    from dgae_jax.export import video
-    from dgae_jax.run import runtime
-    from dgae_jax.run.terminal import Reporter
-
-    runtime.use_devices(configs[0], RunOptions(devices=1, num_processes=1))
-    runtime.use_cache(arguments.cache_dir)
-    clip = video.Clip(arguments.episodes, arguments.seed, arguments.seconds)
-    paths = [arguments.run_dir, *arguments.compare]
-    if arguments.during:
-        scenes = video.of_checkpoints(arguments.run_dir, configs[0], arguments.index, clip)
-    else:
-        runs = list(zip(_titles(paths), paths, configs, strict=True))
-        scenes = video.of_runs(runs, arguments.checkpoint or "latest", arguments.index, clip)
-    stem, size = _stem(arguments), (arguments.width, arguments.height)
-    with Reporter() as reporter:
-        frames = video.frames(scenes, *size, arguments.fps, reporter.watch)
-        try:
-            written = encoding.write(
-                frames, stem, encoding.FORMATS[arguments.format], arguments.fps
-            )
-        except OSError as reason:
-            raise invalid(
-                "out", stem, f"a file that can be written ({reason.strerror})"
-            ) from reason
-    for path in written:
-        terminal.say(f"written to {path} ({path.stat().st_size / 1e6:.1f} MB)")
-    return 0
+FIGURES = {"robots": ("png",), "transport": ("png", "svg")}
+"""The figures, each a function of `dgae_jax.export.figures`, and their files."""
 
 
-if __name__ == "__main__":
-    sys.exit(main())
+@dataclass(frozen=True)
+class FiguresArguments:
+    """Draw the figures of the paper that need no training.
+
+    Examples:
+      dgae figures
+      dgae figures --only transport
+      dgae figures --only robots --out docs/images
+    """
+
+    out: Path = Path("figures")
+    """Directory to write, made if it is not there [path]."""
+    only: Literal["robots", "transport"] | None = None
+    """robots (Fig. 1: the four robots) or transport (Fig. 2: optimal transport and the directional
+    metric); by default both."""
+
+
+@parse.command(FiguresArguments)
+def figures(args: FiguresArguments) -> None:
+    """Draw the figures."""
+    names = [args.only] if args.only else list(FIGURES)
+    if "robots" in names:
+        gl.choose()
+    from dgae_jax.export import figures
+
+    with parse.writing(args.out, "directory"):
+        args.out.mkdir(parents=True, exist_ok=True)
+        for name in names:
+            figure = getattr(figures, name)()
+            for kind in FIGURES[name]:
+                figures.save(figure, args.out / f"{name}.{kind}")
+                terminal.say(f"written to {args.out / name}.{kind}")

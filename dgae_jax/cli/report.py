@@ -1,88 +1,105 @@
-"""Report on studies: dgae report STUDY …
+"""Report on sweeps: `dgae report STUDY …`."""
 
-Flags are checked before the rest is imported: Matplotlib takes a second to load.
-"""
-
+import subprocess
 import sys
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import tyro
 
-from dgae_jax.cli.arguments import fail, parse, stopped
-from dgae_jax.cli.source import check_directory
+from dgae_jax.cli import parse
 from dgae_jax.configs.config import ConfigError, invalid
+from dgae_jax.envs.registry import spec_of
 from dgae_jax.run import terminal
 
-PURPOSE = "Figures, tables and one page of HTML from the results of studies."
-
-EXAMPLES = (
-    "dgae report studies/tuned",
-    "dgae report studies/tuned studies/wide --out comparison",
-    "dgae report studies/tuned --published --videos",
-)
+if TYPE_CHECKING:
+    from dgae_jax.report.results import Row, Sweep
 
 
 @dataclass(frozen=True)
 class Arguments:
-    """What to report on, and where to write it."""
+    """Write figures, tables and one page of HTML from the results of sweeps.
+
+    Examples:
+      dgae report studies/tuned
+      dgae report studies/tuned studies/wide --out comparison
+      dgae report studies/tuned --published --videos
+    """
 
     studies: tyro.conf.Positional[tuple[Path, ...]]
-    """Directories of studies, or files of their results; several are compared with the first [paths]."""
+    """Directories of sweeps, or files of their results; several are compared with the first
+    [paths]."""
     out: Path | None = None
-    """Directory to write to; by default report in the directory of the first study [path]."""
+    """Directory to write to; by default report in the directory of the first sweep [path]."""
     published: bool = False
     """Mark results that others have published in the learning curves."""
     videos: bool = False
-    """Film a typical run of each task for the page: of the best algorithm, the seed in the middle; they stay in STUDY/videos."""
+    """Show a video of a typical run of each task, the median seed of the best algorithm; they are
+    kept in STUDY/videos."""
     markdown: Path | None = None
-    """A Markdown file in which the tables between `<!-- dgae report: NAME -->` and `<!-- /dgae report -->` are replaced; NAME is
-    returns, improvement, attribution, attribution-over-tasks, risk, reach or speed, and NAME of STUDY a table that only a report on
-    that study replaces [path]."""
+    """A Markdown file in which the tables between `<!-- dgae report: NAME -->` and
+    `<!-- /dgae report -->` are replaced. NAME is returns, improvement, attribution,
+    attribution-over-tasks, risk, reach or speed; NAME of STUDY is a table that only a report on
+    that sweep replaces [path]."""
 
 
-def main() -> int:
-    """Write a report; 0 done, 2 bad input, 130 stopped by SIGINT."""
-    terminal.prepare()
-    try:
-        return _report(parse(Arguments, PURPOSE, examples=EXAMPLES))
-    except ConfigError as mistake:
-        fail(mistake)
-    except KeyboardInterrupt:
-        return stopped("stopped by SIGINT, the report is not complete")
-
-
-def _report(arguments: Arguments) -> int:
-    """Everything that can be wrong is looked at before the first file is written."""
+@parse.command(Arguments)
+def report(args: Arguments) -> None:
+    """Write a report, after everything that can be wrong was checked."""
     from dgae_jax.report import results
 
-    if not arguments.studies:
-        raise ConfigError(
-            "STUDIES: must be the directory of one study or more (--help lists every flag)"
-        )
-    if arguments.markdown and len(arguments.studies) > 1:
-        raise invalid("markdown", arguments.markdown, "left out where several studies are compared")
-    studies = [results.read(path) for path in arguments.studies]
-    out = arguments.out or studies[0].directory / "report"
-    check_directory(out)
-    known = results.published() if arguments.published else []
-    from dgae_jax.cli import films
+    if not args.studies:
+        raise ConfigError("STUDIES: must be the directory of one sweep or more")
+    if args.markdown and len(args.studies) > 1:
+        raise invalid("markdown", args.markdown, "left out where several sweeps are compared")
+    sweeps = [results.read(path) for path in args.studies]
+    out = args.out or sweeps[0].directory / "report"
+    parse.check_directory(out)
+    published = results.published() if args.published else []
     from dgae_jax.report import groups, markdown, page
 
-    if arguments.markdown:
-        markdown.check(arguments.markdown, studies[0].name)
-    if arguments.videos:
-        for path in (path for study in studies for path in films.make(study)):
-            terminal.say(f"written {path}")
-    for path in page.write(studies, out, known):
+    if args.markdown:
+        markdown.check(args.markdown, sweeps[0].name)
+    for sweep in sweeps if args.videos else ():
+        _write_videos(sweep)
+    for path in page.write(sweeps, out, published):
         terminal.say(f"written {path}")
-    if arguments.markdown:
-        names = markdown.replace(
-            arguments.markdown, groups.groups_of(studies[0].rows), studies[0].name
-        )
-        terminal.say(f"written {arguments.markdown}: {', '.join(names)}")
-    return 0
+    if args.markdown:
+        tables = groups.groups_of(sweeps[0].rows)
+        names = markdown.replace(args.markdown, tables, sweeps[0].name)
+        terminal.say(f"written {args.markdown}: {', '.join(names)}")
 
 
-if __name__ == "__main__":
-    sys.exit(main())
+def typical(rows: list["Row"]) -> "Row":
+    """Return the median seed, the better of two, of the algorithm with the highest mean return."""
+    returns: dict[str, list[float]] = {}
+    for row in sorted(rows, key=lambda row: row.algo):
+        returns.setdefault(row.algo, []).append(row.final)
+    best = max(returns, key=lambda algo: sum(returns[algo]) / len(returns[algo]))
+    ordered = sorted((row for row in rows if row.algo == best), key=lambda row: row.final)
+    return ordered[len(ordered) // 2]
+
+
+def _write_videos(sweep: "Sweep") -> None:
+    """Render the typical run of each task that has no video yet."""
+    for task in dict.fromkeys(row.task for row in sweep.rows):
+        rows = [row for row in sweep.rows if row.task == task]
+        out = sweep.directory / "videos" / f"{task.replace(':', '-')}.mp4"
+        if out.exists() or not spec_of(rows[0].env).eval_envs:
+            continue
+        chosen = typical(rows)
+        run_dir = sweep.directory / "runs" / chosen.run
+        if not run_dir.is_dir():
+            raise invalid("videos", True, f"left out: the runs of {sweep.path} are not here")
+        out.parent.mkdir(exist_ok=True)
+        terminal.say(f"rendering {chosen.run}")
+        index = chosen.seed - int(chosen.config["seed"])
+        flags = f"--format mp4 --seconds 8 --index {index}".split()
+        # in its own process: OpenGL is chosen before MuJoCo is loaded
+        words = [sys.executable, "-m", "dgae_jax", "render", str(run_dir), "--out", str(out)]
+        done = subprocess.run([*words, *flags], capture_output=True, text=True, check=False)
+        if done.returncode:
+            reason = done.stderr.strip().removeprefix("error: ")
+            raise ConfigError(f"videos: must be left out: {reason}", "videos")
+        terminal.say(f"written {out}")

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from dgae_jax.cli import calibrate
+from dgae_jax.cli import evaluate
 from dgae_jax.maths.transport import quantile_midpoints
 from dgae_jax.report import figures
 from dgae_jax.run import calibration, directory, training
@@ -104,10 +104,9 @@ def test_the_critics_of_all_kinds_of_quantiles_can_be_compared(tmp_path):
     }
     for name, config in made.items():
         directory.create(tmp_path / name, config, runs.QUIET)
-    checked, _ = calibrate._checked(calibrate.Arguments(tuple(tmp_path / name for name in made)))
-    assert {path.name: config.critic.kind for path, config in checked.items()} == {
-        name: name for name in made
-    }
+    paths = tuple(tmp_path / name for name in made)
+    configs, _ = evaluate._check_calibrate(evaluate.CalibrateArguments(run_dirs=paths))
+    assert tuple(config.critic.kind for config in configs) == kinds
 
 
 def test_runs_of_the_same_name_are_refused(tmp_path, monkeypatch, capsys):
@@ -118,7 +117,7 @@ def test_runs_of_the_same_name_are_refused(tmp_path, monkeypatch, capsys):
     )
     with pytest.raises(SystemExit, match="2"):
         helpers.command("calibrate")()
-    assert "RUN_DIRS run run: must be of different names" in capsys.readouterr().err
+    assert "RUN_DIRS run run: must have different names" in capsys.readouterr().err
 
 
 @pytest.mark.slow  # a program of its own is compiled
