@@ -186,7 +186,7 @@ def refit(args: RefitArguments) -> None:
     how = {"which": args.checkpoint, "index": args.index, "seed": args.seed}
     with terminal.Reporter() as reporter:
         found = calibration.refit(
-            args.run_dir, config, worlds=args.num_envs, watch=reporter.watch, **how
+            args.run_dir, config, num_envs=args.num_envs, watch=reporter.watch, **how
         )
     with parse.writing(out):
         checkpoint.save_networks(out, found.config, found.networks, found.std)

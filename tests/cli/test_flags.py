@@ -20,7 +20,7 @@ from tests.helpers import ROOT
 
 def one_line(text):
     """The words in tyro's boxes, without the frames."""
-    return " ".join(re.sub("[╭╮╰╯│─]", " ", text).split())
+    return " ".join(re.sub(r"[╭╮╰╯│─]|^[|+]|[|+]$|-{3,}", " ", text, flags=re.M).split())
 
 
 def test_flags_start_from_the_preset_of_task_and_algorithm():
@@ -115,7 +115,7 @@ def test_mistakes_are_refused_with_the_flag_and_what_is_allowed(
     code, out, err = dgae(*line.split())
     assert (code, out) == (2, "")
     assert message in one_line(err)
-    assert err.startswith("╭") or err.count("\n") == 1
+    assert err.startswith("error: ") == (err.count("\n") == 1)
     assert list(tmp_path.iterdir()) == []
 
 
@@ -145,7 +145,8 @@ def test_mistakes_help_and_versions_import_no_jax():
     code = """
 import sys
 from dgae_jax.cli.main import main
-for argv in (["train", "--gamma", "1.5"], ["--version"], *([name, "--help"] for name in sys.argv[1:])):
+lines = [["train", "--gamma", "1.5"], ["--version"], *([name, "--help"] for name in sys.argv[1:])]
+for argv in lines:
     sys.argv = ["dgae", *argv]
     try:
         main()
@@ -175,9 +176,7 @@ def test_help_shows_the_defaults_of_the_algorithm(dgae):
 def test_help_explains_every_flag(name, dgae):
     code, out, err = dgae(name, "--help")
     assert (code, err) == (0, "")
-    flags = re.findall(r"^│ (--\S.*?|[A-Z-]+ .*?) +│\n│ +(\S)|^│ (-\S.*?)  ", out, re.M)
-    assert flags
-    assert "(required)" not in {text for _, text, _ in flags}
+    assert not re.search(r"(FLOAT|INT|STR|PATH|\]\]|\}) \((default|required)", one_line(out))
 
 
 def test_help_names_every_command_and_flags_of_train(dgae):
@@ -192,7 +191,7 @@ def test_help_names_every_command_and_flags_of_train(dgae):
 EXAMPLES = [
     line.strip()
     for name in COMMANDS
-    for line in re.findall(r"^ +(dgae .*)$", command(name).arguments.__doc__, re.MULTILINE)
+    for line in re.findall(r"^ {6}(dgae .*)$", command(name).arguments.__doc__, re.MULTILINE)
 ]
 
 

@@ -11,7 +11,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 import dgae_jax as dg
-from dgae_jax.cli.arguments import fail
+from dgae_jax.cli.parse import fail
 from dgae_jax.cli.train import parsed
 from dgae_jax.configs.config import ConfigError
 from dgae_jax.configs.resolved import resolve
