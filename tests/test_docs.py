@@ -56,8 +56,9 @@ def command_lines():
     pattern = r"(?:^ {4,}|^|`|&& )dgae ([a-z]+)((?:\\\n|[^`\n&;)])*)"
     for path in DOCUMENTS[:1] + DOCUMENTS[2:]:
         for name, rest in re.findall(pattern, TEXTS[path], re.MULTILINE):
-            if name in COMMANDS and "…" not in rest:
-                yield name, shlex.split(rest.replace("\\\n", " "), comments=True)
+            words = shlex.split(rest.replace("\\\n", " "), comments=True)
+            if name in COMMANDS and words:
+                yield name, words
 
 
 @pytest.mark.parametrize("block", BLOCKS)
