@@ -96,42 +96,6 @@ def test_agent_plays_the_episodes_of_an_evaluation(exported):
     assert float(summary.split()[1].rstrip(",")) == pytest.approx(np.mean(played), abs=1e-3)
 
 
-@pytest.mark.parametrize("argv", [["--episodes", "0"], ["--seed", "-1"]])
-def test_agent_refuses_invalid_arguments(argv):
-    agent = bundle.TEMPLATES / "agent.py"
-    done = subprocess.run([sys.executable, agent, *argv], capture_output=True, text=True)
-    assert done.returncode == 2
-    assert "--episodes must be at least 1 and --seed at least 0" in done.stderr
-
-
-def test_arrays_are_those_of_the_checkpoint_and_the_task(trained):
-    config = read_config(trained)
-    found = checkpoint.load_networks(trained, config, "latest")
-    made = arrays.arrays_of(found, config, 1)
-    assert_array_equal([made["action_low"], made["action_high"]], [[-1] * 3, [1] * 3])
-    assert_array_equal(made["observation_std"], found.policy.obs_stats.std[1])
-    head = found.critic.params["params"]["Dense_0"]
-    assert_array_equal(made["critic_weight_1"], head["kernel"][1])
-    about = {name: made[name].item() for name in ("env", "episode_length", "observation_limit")}
-    assert about == {"env": "Hopper-v4", "episode_length": 20, "observation_limit": 10}
-
-
-def test_numpy_policy_by_hand():
-    # normalized to (2, -10) by mean 1, std 2 and limit 10; 3 tanh(2) + 1 is clipped to 2
-    made = {
-        "observation_mean": [1, 0], "observation_std": [2, 1], "observation_limit": 10,
-        "policy_weight_0": np.eye(2), "policy_bias_0": np.zeros(2),
-        "policy_weight_1": [[3], [0]], "policy_bias_1": [1],
-        "critic_weight_0": [[1, 0], [0, 0.1]], "critic_bias_0": np.zeros(2),
-        "critic_weight_1": [[1, 0], [0, 2]], "critic_bias_1": [0, 5],
-        "action_low": [-2], "action_high": [2],
-    }  # fmt: skip
-    policy = Policy.__new__(Policy)
-    policy.arrays = {name: np.asarray(x, np.float32) for name, x in made.items()}
-    assert_allclose(policy([5, -99]), [2])
-    assert_allclose(policy.quantiles([5, -99]), [np.tanh(2), 5 + 2 * np.tanh(-1)], rtol=1e-6)
-
-
 def test_custom_networks_are_refused(trained):
     config = read_config(trained)
     found = checkpoint.load_networks(trained, config, "latest")

@@ -13,19 +13,14 @@ import jax
 import numpy as np
 import pytest
 from brax.envs.wrappers.training import EpisodeWrapper
-from gymnasium.envs.registration import EnvSpec
 from gymnasium.error import ClosedEnvironmentError, ResetNeeded
-from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
-from gymnasium.wrappers.vector import NormalizeObservation, RecordEpisodeStatistics
 from numpy.testing import assert_allclose, assert_array_equal
 
 import dgae_jax as dg
 from dgae_jax.envs.registry import custom_env
 from dgae_jax.export import gl
-from dgae_jax.physics.registry import ENGINES
 from tests.helpers import GYM_TASKS
-from tests.parity import WARP
 from tests.probes import Counter
 
 CLOSE = functools.partial(assert_allclose, rtol=1e-10, atol=1e-10)
@@ -208,49 +203,6 @@ def test_nonfinite_env_terminates_and_is_reported():
     assert infos["_nonfinite"].tolist() == [True, False, True]
 
 
-class SingleEnv(gymnasium.Env):
-    """A `gymnasium.Env` over a vector of one."""
-
-    def __init__(self):
-        self.vector = hoppers("Disabled", num_envs=1)
-        self.observation_space = self.vector.single_observation_space
-        self.action_space = self.vector.single_action_space
-
-    def reset(self, *, seed=None, options=None):
-        super().reset(seed=seed)
-        obs, _ = self.vector.reset(seed=seed, options=options)
-        return obs[0], {}
-
-    def step(self, action):
-        obs, reward, *ends, infos = self.vector.step(action[None])
-        ends = [bool(end[0]) for end in ends]
-        return obs[0], reward[0], *ends, {name: x[0] for name, x in infos.items()}
-
-
-def test_passes_gymnasiums_checker():
-    env = SingleEnv()
-    env.spec = EnvSpec("SingleEnv-v0", entry_point=SingleEnv)  # without one seeds are not checked
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always")
-        check_env(env)
-    # observations have no bounds, as Gymnasium's
-    assert [each for each in caught if "infinity" not in str(each.message)] == []
-
-
-def test_gymnasiums_wrappers_go_around_it():
-    env = NormalizeObservation(RecordEpisodeStatistics(hoppers()))
-    env.reset(seed=0)
-    lengths, seen = [], []
-    for action in random_actions(env, 60):
-        obs, _, terminated, truncated, infos = env.step(action)
-        seen.append(obs)
-        if "episode" in infos:
-            lengths += infos["episode"]["l"][terminated | truncated].tolist()
-    assert len(lengths) >= 6
-    assert set(lengths) <= set(range(1, 21))
-    assert np.abs(np.mean(seen[30:], axis=(0, 1))).max() < 1
-
-
 def test_gymnasium_makes_it_by_name():
     name = "dgae_jax.export.vector:dgae_jax/Hopper-v5"
     env = gymnasium.make_vec(name, num_envs=2, physics="native", healthy_reward=3.0)
@@ -312,30 +264,6 @@ def test_calls_at_the_wrong_time_are_refused():
     env.close()
     with pytest.raises(ClosedEnvironmentError):
         env.reset()
-
-
-def test_public_name_exists_before_gymnasium_is_imported():
-    program = "import sys, dgae_jax as dg; print('make_vector_env' in dir(dg), *sys.modules)"
-    out = subprocess.run([sys.executable, "-c", program], check=True, capture_output=True).stdout
-    exists, *modules = out.decode().split()
-    assert exists == "True"
-    assert "gymnasium" not in modules
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    "physics", [pytest.param(name, marks=WARP if name == "mjx-warp" else ()) for name in ENGINES]
-)
-def test_every_engine_steps_as_native(physics):
-    envs = [dg.make_vector_env("hopper", 2, physics=name) for name in (physics, "native")]
-    for env in envs:
-        env.reset(seed=0)
-    for action in random_actions(envs[0], 5):
-        ours, native = (env.step(action) for env in envs)
-        for mine, other in zip(ours[:4], native[:4], strict=True):
-            assert mine.dtype == other.dtype
-            assert_allclose(mine, other, atol=1e-3)
-        assert ours[4].keys() == native[4].keys()
 
 
 @pytest.mark.slow
