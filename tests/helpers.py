@@ -1,4 +1,4 @@
-"""What several test files share: a small configuration, the commands, files made by hand."""
+"""Helpers of several test files: a small configuration, the commands, checkpoints made by hand."""
 
 import dataclasses
 import hashlib
@@ -26,35 +26,30 @@ SMALL = dg.Config(
 
 
 def small(algo, **changes):
-    """The small configuration of an algorithm, without the settings that it does not use."""
-    policy = dg.PolicyConfig(hidden=(8,)) if "trpo" in algo else SMALL.policy
-    critic = (
-        SMALL.critic if algo.startswith("d") else dataclasses.replace(SMALL.critic, quantiles=None)
-    )
-    return dataclasses.replace(SMALL, algo=algo, policy=policy, critic=critic, **changes)
+    """Return the small configuration of an algorithm, without settings that have no effect."""
+    config = dataclasses.replace(SMALL, algo=algo, **changes)
+    if "trpo" in algo:
+        config = dataclasses.replace(config, policy=dg.PolicyConfig(hidden=(8,)))
+    return config if algo.startswith("d") else config.replace(**{"critic.quantiles": None})
 
 
-TINY = ["--physics", "native", "--num-envs", "4", "--num-steps", "16", "--policy.minibatches", "4", "--critic.minibatches", "4",
-        "--policy.hidden", "8", "--critic.hidden", "8", "--cache-dir", str(Path(tempfile.gettempdir()) / "dgae_jax_tests")]  # fmt: skip
+CACHE = f"{tempfile.gettempdir()}/dgae_jax_tests"
+TINY = f"""--physics native --num-envs 4 --num-steps 16 --policy.hidden 8 --critic.hidden 8
+--policy.minibatches 4 --critic.minibatches 4 --cache-dir {CACHE}""".split()
 """Flags of a small run; processes share its compiled programs."""
 
 
 def command(name):
-    """The function of a command."""
+    """Return the function of a command."""
     return main.command(name)
 
 
 def signed(arrays):
-    """Any bytes with the header of a checkpoint."""
-    return (
-        json.dumps(
-            {"schema": checkpoint.SCHEMA, "sha256": hashlib.sha256(arrays).hexdigest()}
-        ).encode()
-        + b"\n"
-        + arrays
-    )
+    """Return any bytes with the header of a checkpoint."""
+    header = {"schema": checkpoint.SCHEMA, "sha256": hashlib.sha256(arrays).hexdigest()}
+    return json.dumps(header).encode() + b"\n" + arrays
 
 
 def distance(a, b):
-    """The largest difference of two trees."""
+    """Return the largest difference of two trees."""
     return max(jax.tree.leaves(jax.tree.map(lambda x, y: float(jnp.abs(x - y).max()), a, b)))
