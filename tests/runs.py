@@ -7,7 +7,7 @@ from pathlib import Path
 import jax.numpy as jnp
 
 from dgae_jax.configs.resolved import resolve
-from dgae_jax.run import checkpoint, metrics
+from dgae_jax.run import checkpoint, directory, metrics
 from dgae_jax.run.options import RunOptions
 from tests import helpers
 
@@ -58,3 +58,9 @@ def stopped_half_way(whole, half):
     (half / "evaluation.json").unlink()
     with (half / "metrics.jsonl").open("a") as file:
         file.write('{"iteration": 9, "ste')
+
+
+def create(path, config=SMALL):
+    """Make a run directory in which nothing was trained yet."""
+    with directory.created(path, config, RunOptions()):
+        pass

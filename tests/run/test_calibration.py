@@ -1,25 +1,25 @@
-"""Critics against the returns that came."""
+"""Critics against Monte Carlo returns, and critics that are fitted to them."""
 
 import dataclasses
-import json
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from dgae_jax.cli import evaluate
+import dgae_jax as dg
+from dgae_jax.configs.config import ConfigError
 from dgae_jax.maths.transport import quantile_midpoints
-from dgae_jax.report import figures
-from dgae_jax.run import calibration, directory, training
-from tests import helpers, runs
+from dgae_jax.run import calibration, checkpoint, directory, episodes, training
+from tests.runs import QUIET, small
 
 UNIFORM = jnp.tile(quantile_midpoints(100), (1000, 1, 1))
-"""Of returns that are uniform on 0 … 1."""
 RETURNS = ((jnp.arange(1000) + 0.5) / 1000)[:, None]
+"""Quantiles of a uniform distribution on 0 … 1, and returns that have it."""
 
 
-def test_a_critic_that_knows_the_distribution_is_calibrated():
-    found = calibration.statistics(UNIFORM, RETURNS)
+def test_true_distribution_is_calibrated():
+    found = calibration.calibration_statistics(UNIFORM, RETURNS)
     assert found["coverage_90"] == pytest.approx(0.9, abs=0.002)
     assert found["pit"] == pytest.approx([1 / calibration.BINS] * calibration.BINS, abs=0.011)
     assert sum(found["pit"]) == pytest.approx(1)
@@ -28,121 +28,98 @@ def test_a_critic_that_knows_the_distribution_is_calibrated():
     assert (found["rmse"], found["spread"]) == pytest.approx((12**-0.5, 12**-0.5), abs=1e-4)
 
 
-def test_a_critic_half_as_wide_holds_half_of_the_returns_and_leaves_the_rest_at_both_ends():
-    found = calibration.statistics(0.25 + UNIFORM / 2, RETURNS)
+def test_half_as_wide_distribution_covers_half():
+    found = calibration.calibration_statistics(0.25 + UNIFORM / 2, RETURNS)
     assert found["coverage_90"] == pytest.approx(0.45, abs=0.002)
     assert found["pit"][0] == pytest.approx(found["pit"][-1], abs=0.011)
     assert found["pit"][0] + found["pit"][-1] == pytest.approx(0.55, abs=0.02)
 
 
-def test_neighbours_in_the_wrong_order_are_counted():
-    assert calibration.statistics(UNIFORM[..., ::-1], RETURNS)["crossing"] == 1
+def test_crossing_quantiles_are_counted():
+    assert calibration.calibration_statistics(UNIFORM[..., ::-1], RETURNS)["crossing"] == 1
 
 
-def test_means_are_similar_where_target_and_prediction_differ_in_shape_alone():
+def test_similar_means_differ_in_shape_alone():
     reward, discount = jnp.zeros((4, 1)), jnp.ones((4, 1))
-    # of two quantiles: twice as wide (d = 0, W₁ = 1), moved by 1 (d = W₁ = 1), moved by −1 on one side and 0.95 on the other
-    quantiles = jnp.array([[-1.0, 1.0], [-2.0, 2.0], [-1.0, 3.0], [-2.0, 3.95]])[:, None]
+    # twice as wide (d = 0, W₁ = 1), moved by 1 (d = W₁ = 1), moved by −1 and by 0.95:
     # d = (−1 + 0.95) / 2 = −0.025 and W₁ = 0.975 in the last step, a share of 0.0256
-    assert calibration.similar(reward, discount, quantiles) == pytest.approx(
-        {"0.1": 2 / 3, "0.03": 2 / 3, "0.01": 1 / 3, "0.003": 1 / 3}, abs=1e-6
-    )
+    quantiles = jnp.array([[-1.0, 1.0], [-2.0, 2.0], [-1.0, 3.0], [-2.0, 3.95]])[:, None]
+    expected = {"0.1": 2 / 3, "0.03": 2 / 3, "0.01": 1 / 3, "0.003": 1 / 3}
+    found = calibration.similar_mean_shares(reward, discount, quantiles)
+    assert found == pytest.approx(expected, abs=1e-6)
 
 
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [
-        ({"algo": "ppo"}, "must be a run with a value distribution, not ppo"),
-        (
-            {"algo": "dppo", "gamma": 0.99999},
-            "gamma 0.99999: must be at most 0.9999, so that returns can be followed to their end",
-        ),
-    ],
-)
-def test_what_cannot_be_compared_is_refused_in_one_line(
-    changes, message, tmp_path, monkeypatch, capsys
-):
-    gamma = changes.pop("gamma", 0.99)
-    directory.create(
-        tmp_path / "run", dataclasses.replace(runs.small(**changes), gamma=gamma), runs.QUIET
-    )
-    monkeypatch.setattr("sys.argv", ["dgae calibrate", str(tmp_path / "run")])
-    with pytest.raises(SystemExit, match="2"):
-        helpers.command("calibrate")()
-    assert message in capsys.readouterr().err
+def test_returns_without_end_are_refused():
+    with pytest.raises(ConfigError, match=r"gamma 0\.99999: must be at most 0\.9999"):
+        calibration.check_returns(dataclasses.replace(small("dppo"), gamma=0.99999))
+    pendulum = {"env": "gymnasium:Pendulum-v1", "env_version": None, "physics": "gymnasium"}
+    with pytest.raises(ConfigError, match=r"env gymnasium:Pendulum-v1: must be a task without"):
+        calibration.check_returns(dataclasses.replace(small("ppo"), **pendulum))
 
 
-@pytest.mark.parametrize(
-    ("out", "message"),
-    [
-        ("x.pdf", "--out x.pdf: must be a file whose name ends in .png"),
-        ("there/x.png", "--out there/x.png: must be a file in a directory that exists"),
-        (
-            "taken.png",
-            "--out taken.json: must be a file, not a directory, a link or a device",
-        ),  # where the statistics would go
-    ],
-)
-def test_a_picture_that_cannot_be_written_is_refused_before_anything_is_played(
-    out, message, tmp_path, monkeypatch, capsys
-):
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "taken.json").mkdir()
-    directory.create(tmp_path / "run", runs.small("dppo"), runs.QUIET)
-    monkeypatch.setattr("sys.argv", ["dgae calibrate", "run", "--out", out])
-    with pytest.raises(SystemExit, match="2"):
-        helpers.command("calibrate")()
-    assert message in capsys.readouterr().err
+def fitted_quantiles(obs, returns):
+    samples = calibration.Samples(obs[:, None], returns)
+    network = calibration.initial_network(samples, 16, hidden=(32,))
+    params = calibration.fit_quantiles(network, samples, 200, jax.random.key(2))
+    return network.apply(params, jnp.array([[-1.0], [1.0]]))
 
 
-def test_the_critics_of_all_kinds_of_quantiles_can_be_compared(tmp_path):
-    plain = runs.small("dppo")
-    kinds = ("quantile", "sorted", "ordered")
-    made = {
-        kind: dataclasses.replace(plain, critic=dataclasses.replace(plain.critic, kind=kind))
-        for kind in kinds
-    }
-    for name, config in made.items():
-        directory.create(tmp_path / name, config, runs.QUIET)
-    paths = tuple(tmp_path / name for name in made)
-    configs, _ = evaluate._check_calibrate(evaluate.CalibrateArguments(run_dirs=paths))
-    assert tuple(config.critic.kind for config in configs) == kinds
+def uniform_pair():
+    which, height = (jax.random.uniform(jax.random.key(i), (20_000,)) for i in range(2))
+    return jnp.where(which < 0.5, -1.0, 1.0), height
 
 
-def test_runs_of_the_same_name_are_refused(tmp_path, monkeypatch, capsys):
-    for parent in ("a", "b"):
-        directory.create(tmp_path / parent / "run", runs.small("dppo"), runs.QUIET)
-    monkeypatch.setattr(
-        "sys.argv", ["dgae calibrate", *(str(tmp_path / parent / "run") for parent in ("a", "b"))]
-    )
-    with pytest.raises(SystemExit, match="2"):
-        helpers.command("calibrate")()
-    assert "RUN_DIRS run run: must have different names" in capsys.readouterr().err
+@pytest.mark.parametrize("lowest", [0.0, -1_500.0])
+def test_fit_finds_quantiles_of_uniform_returns(lowest):
+    # F⁻¹(τ) = l + cτ of a uniform variable on l … l + c; c is 1 in one state, 3 in the other
+    obs, height = uniform_pair()
+    found = fitted_quantiles(obs, lowest + height * (2 + obs))
+    expected = lowest + jnp.array([[1.0], [3.0]]) * quantile_midpoints(16)
+    np.testing.assert_allclose(found, expected, atol=0.06)
 
 
-@pytest.mark.slow  # a program of its own is compiled
-def test_the_command_writes_the_statistics_of_every_run_and_a_picture(
-    tmp_path, monkeypatch, capsys
-):
-    training.train(runs.small("dppo"), dataclasses.replace(runs.QUIET, run_dir=tmp_path / "run"))
-    monkeypatch.setattr(
-        "sys.argv", ["dgae calibrate", str(tmp_path / "run"), "--cache-dir", runs.QUIET.cache_dir]
-    )
-    assert helpers.command("calibrate")() == 0
-    found = json.loads((tmp_path / "run" / "calibration.json").read_text())["run"]
-    assert (
-        found["samples"] == calibration.WORLDS * calibration.CHUNK
-    )  # episodes of 20 steps, in whole chunks
-    assert np.isfinite(
-        [*found["pit"], found["rmse"], found["crps"], *found["similar_means"].values()]
-    ).all()
-    assert (tmp_path / "run" / "calibration.png").read_bytes().startswith(b"\x89PNG")
-    assert "run: fewer than 10 quantiles have no central 90 %, " in capsys.readouterr().out
+def test_fit_finds_a_rare_loss():
+    # one state pays 1, the other 0 with probability ¼: F⁻¹ is 0 up to ¼ and 1 beyond
+    obs, luck = uniform_pair()
+    found = fitted_quantiles(obs, jnp.where((obs > 0) & (luck < 0.25), 0.0, 1.0))
+    assert np.abs(found[0] - 1).max() < 0.1
+    np.testing.assert_allclose(found[1], [0.0] * 4 + [1.0] * 12, atol=0.15)
 
 
-def test_what_is_said_of_coverage_is_a_share_where_there_are_enough_quantiles():
-    assert figures.coverage({"coverage_90": 0.874}) == "87 % of the returns in the central 90 %"
-    assert (
-        figures.coverage(calibration.statistics(UNIFORM[..., :9], RETURNS))
-        == "fewer than 10 quantiles have no central 90 %"
-    )
+@pytest.mark.slow  # programs of their own are compiled
+@pytest.mark.parametrize("algo", ["ppo", "dppo"])
+def test_refit_keeps_the_policy_and_is_calibrated(algo, tmp_path):
+    run_dir, file = tmp_path / "run", tmp_path / "refit.msgpack"
+    training.train(small(algo, seeds=2), dataclasses.replace(QUIET, run_dir=run_dir))
+    config = directory.read_config(run_dir)
+
+    def write():
+        made = calibration.refit(run_dir, config, which="latest", index=1, num_envs=16)
+        checkpoint.save_networks(file, made.config, made.networks, made.std)
+        return made
+
+    assert write().returns == 16 * episodes.SAMPLED_CHUNK  # episodes of 20 steps, in whole chunks
+    before = file.read_bytes()
+    write()
+    assert file.read_bytes() == before
+    whole, alone = dg.load_policy(run_dir, seed=1), dg.load_policy(file)
+    obs = np.random.default_rng(0).normal(size=(100, 11))
+    np.testing.assert_array_equal(alone(obs), whole(obs))
+    assert alone.quantiles(obs).shape == (100, 8 if algo == "dppo" else 64)
+    assert (np.diff(alone.quantiles(obs)) >= 0).all()
+    after = directory.config_of(file)
+    assert (after.seed, after.num_seeds, after.critic.kind) == (config.seed + 1, 1, "sorted")
+    assert checkpoint.reward_std(file, after) > 0
+    found = calibration.calibrate(file, after, which="latest")
+    assert found["samples"] == calibration.NUM_ENVS * episodes.SAMPLED_CHUNK
+    assert found["crossing"] == 0
+    assert np.isfinite([*found["pit"], found["rmse"], *found["similar_means"].values()]).all()
+
+
+def test_policy_file_without_reward_scale_is_refused(finished, tmp_path):
+    config, file = directory.read_config(finished), tmp_path / "old.msgpack"
+    policy, critic, _ = checkpoint.load_networks(finished, config, "latest")
+    parts = checkpoint._networks(policy.params, critic.params, policy.obs_stats)
+    checkpoint.write(file, config, checkpoint.arrays_of(parts))
+    with pytest.raises(checkpoint.CheckpointError, match="lacks the scale of rewards; dgae refit"):
+        checkpoint.reward_std(file, config)

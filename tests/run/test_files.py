@@ -1,4 +1,4 @@
-"""Files that are whole or not there."""
+"""Atomic files and JSON."""
 
 import json
 import os
@@ -12,22 +12,25 @@ import pytest
 from dgae_jax.run import files
 
 
-def test_a_file_and_then_the_directory_that_names_it_are_synced(tmp_path, monkeypatch):
+def test_file_and_directory_are_synced(tmp_path, monkeypatch):
     order, sync, rename = [], os.fsync, Path.replace
-    monkeypatch.setattr(
-        os,
-        "fsync",
-        lambda fd: order.append(str(Path(f"/proc/self/fd/{fd}").readlink())) or sync(fd),
-    )
-    monkeypatch.setattr(
-        Path, "replace", lambda part, to: order.append("rename") or rename(part, to)
-    )
+
+    def fsync(descriptor):
+        order.append(str(Path(f"/proc/self/fd/{descriptor}").readlink()))
+        sync(descriptor)
+
+    def replace(part, to):
+        order.append("rename")
+        return rename(part, to)
+
+    monkeypatch.setattr(os, "fsync", fsync)
+    monkeypatch.setattr(Path, "replace", replace)
     files.replace(tmp_path / "a", b"x")
     assert order == [str(tmp_path / "a.part"), "rename", str(tmp_path)]
 
 
 @pytest.mark.parametrize("step", ["fsync", "replace"])
-def test_a_file_that_cannot_be_finished_leaves_what_was_there(step, tmp_path, monkeypatch):
+def test_failed_write_leaves_old_content(step, tmp_path, monkeypatch):
     files.replace(tmp_path / "a", b"before")
 
     def fail(*_):
@@ -41,25 +44,17 @@ def test_a_file_that_cannot_be_finished_leaves_what_was_there(step, tmp_path, mo
     assert [p.name for p in tmp_path.iterdir()] == ["a"]
 
 
-def test_numbers_that_are_not_finite_are_null_in_json_however_deep(tmp_path):
-    data = {
-        "a": float("nan"),
-        "b": [1.5, float("inf"), {"c": (-float("inf"), np.float64("nan"))}],
-        "d": "NaN",
-        "e": 1,
-    }
+def test_nonfinite_numbers_are_null_in_json(tmp_path):
+    nan, inf = float("nan"), float("inf")
+    data = {"a": nan, "b": [1.5, inf, {"c": (-inf, np.float64("nan"))}], "d": "NaN"}
     files.write_json(tmp_path / "a.json", data)
     files.append_rows(tmp_path / "a.jsonl", [data])
     for name in ("a.json", "a.jsonl"):
-        assert json.loads((tmp_path / name).read_text()) == {
-            "a": None,
-            "b": [1.5, None, {"c": [None, None]}],
-            "d": "NaN",
-            "e": 1,
-        }
+        found = json.loads((tmp_path / name).read_text())
+        assert found == {"a": None, "b": [1.5, None, {"c": [None, None]}], "d": "NaN"}
 
 
-def test_of_several_that_write_in_a_directory_each_has_its_turn(tmp_path):
+def test_writers_of_a_directory_take_turns(tmp_path):
     inside, most = [], []
 
     def work(_):

@@ -1,35 +1,46 @@
-"""The growing file of metrics."""
+"""Metrics, evaluations and the learning curve."""
+
+import time
 
 import numpy as np
 import pytest
+from matplotlib.image import imread
 
 import dgae_jax as dg
 from dgae_jax.configs.config import ConfigError
-from dgae_jax.run import metrics
+from dgae_jax.configs.resolved import resolve
+from dgae_jax.run import checkpoint, files, logger, metrics
+from dgae_jax.run.logger import RunLogger
+from dgae_jax.run.metrics import EvaluationsFile, MetricsFile
+from dgae_jax.run.options import RunOptions
+from tests.runs import SMALL
+
+CONFIG = resolve(dg.Config(num_envs=10, num_steps=10))
 
 
-def test_metrics_are_one_json_object_per_run_and_iteration(tmp_path):
-    config = dg.Config(seed=7, num_seeds=2, num_envs=10, num_steps=10)
-    file = metrics.MetricsFile(tmp_path / "metrics.jsonl", config, 0)
-    columns = {
-        "episode_return": np.array([[1.5, np.nan], [2.0, 3.0], [0, 0]]),
-        "episodes": np.array([[0, 1], [2, 3], [0, 0]]),
-    }
-    file.append(columns, 2, 1.0)
-    file.append(columns, 1, 2.0)
-    rows = metrics.read(tmp_path / "metrics.jsonl")
-    assert [(r["iteration"], r["steps"], r["seed"], r["episode_return"], r["episodes"]) for r in rows] == [
-        (1, 100, 7, 1.5, 0), (1, 100, 8, None, 1), (2, 200, 7, 2, 2), (2, 200, 8, 3, 3), (3, 300, 7, 1.5, 0), (3, 300, 8, None, 1),
-    ]  # fmt: skip
-    assert "NaN" not in (tmp_path / "metrics.jsonl").read_text()
+def test_one_row_per_iteration_and_seed(tmp_path):
+    config = resolve(dg.Config(seed=7, num_seeds=2, num_envs=10, num_steps=10))
+    path = tmp_path / "metrics.jsonl"
+    file = MetricsFile(path, config, 0)
+    returns = np.array([[1.5, np.nan], [2.0, 3.0], [0, 0]])
+    file.append({"episode_return": returns, "episodes": returns > 1}, 2, 1.0)
+    file.append({"episode_return": returns, "episodes": returns > 1}, 1, 2.0)
+    names = "iteration", "steps", "seed", "seconds", "episode_return", "episodes"
+    assert [tuple(row[name] for name in names) for row in metrics.read(path)] == [
+        (1, 100, 7, 1, 1.5, 1),
+        (1, 100, 8, 1, None, 0),
+        (2, 200, 7, 1, 2, 1),
+        (2, 200, 8, 1, 3, 1),
+        (3, 300, 7, 2, 1.5, 1),
+        (3, 300, 8, 2, None, 0),
+    ]
 
 
-def test_metrics_continue_behind_the_checkpoint_whatever_followed_it(tmp_path):
-    config, path = dg.Config(num_envs=10, num_steps=10), tmp_path / "metrics.jsonl"
-    columns = {"episode_return": np.arange(8.0)[:, None]}
-    metrics.MetricsFile(path, config, 0).append(columns, 8, 1.5)
+def test_metrics_continue_behind_the_checkpoint(tmp_path):
+    path, columns = tmp_path / "metrics.jsonl", {"episode_return": np.arange(8.0)[:, None]}
+    MetricsFile(path, CONFIG, 0).append(columns, 8, 1.5)
     path.write_text(path.read_text() + '{"iteration": 9, "st')  # torn
-    file = metrics.MetricsFile(path, config, 5)
+    file = MetricsFile(path, CONFIG, 5)
     assert (file.iteration, file.seconds) == (5, 1.5)
     file.append(columns, 2, 2.0)
     assert [row["iteration"] for row in metrics.read(path)] == [1, 2, 3, 4, 5, 6, 7]
@@ -37,11 +48,123 @@ def test_metrics_continue_behind_the_checkpoint_whatever_followed_it(tmp_path):
     np.testing.assert_array_equal(steps, 100 * np.arange(1, 8))
     np.testing.assert_array_equal(returns[:, 0], [0, 1, 2, 3, 4, 0, 1])
     with pytest.raises(ConfigError, match="must hold the 9 iterations"):
-        metrics.MetricsFile(path, config, 9)
-    for seconds in ("NaN", "Infinity", "-1", '"inf"', "null"):
-        path.write_text(path.read_text().replace('"seconds": 2.0', f'"seconds": {seconds}'))
-        before = path.read_bytes()
-        with pytest.raises(ConfigError, match="must hold the 7 iterations"):
-            metrics.MetricsFile(path, config, 7)
-        assert path.read_bytes() == before
-        path.write_text(path.read_text().replace(f'"seconds": {seconds}', '"seconds": 2.0'))
+        MetricsFile(path, CONFIG, 9)
+
+
+@pytest.mark.parametrize("seconds", ["NaN", "Infinity", "-1", '"inf"', "null"])
+def test_impossible_time_is_refused_and_left(seconds, tmp_path):
+    path = tmp_path / "metrics.jsonl"
+    MetricsFile(path, CONFIG, 0).append({"episode_return": np.zeros((2, 1))}, 2, 2.0)
+    path.write_text(path.read_text().replace('"seconds": 2.0', f'"seconds": {seconds}'))
+    before = path.read_bytes()
+    with pytest.raises(ConfigError, match="must hold the 2 iterations"):
+        MetricsFile(path, CONFIG, 2)
+    assert path.read_bytes() == before
+
+
+MEANS = {100: (1.0, 9.0), 200: (6.0, 6.0), 300: (2.0, 10.0), 400: (5.0, 5.0)}
+EVALUATIONS = [
+    {"steps": steps, "seed": seed, "return_mean": mean, "return_std": 1.0}
+    for steps, means in MEANS.items()
+    for seed, mean in enumerate(means)
+]
+
+
+def test_best_evaluation_has_highest_mean_over_seeds(tmp_path):
+    path = tmp_path / "evaluations.jsonl"
+    assert EvaluationsFile(path).best is None
+    files.append_rows(path, EVALUATIONS)
+    assert EvaluationsFile(path).best == 300  # of equal ones the later
+    assert not EvaluationsFile(path).has(500)
+    EvaluationsFile(path).cut(250, 2)
+    assert EvaluationsFile(path).best == 200
+    points = [[100, 1, 1], [100, 9, 1], [200, 6, 1], [200, 6, 1]]
+    np.testing.assert_array_equal(EvaluationsFile(path).points(), points)
+
+
+def test_evaluation_without_a_seed_is_cut(tmp_path):
+    path = tmp_path / "evaluations.jsonl"
+    files.append_rows(path, EVALUATIONS[:3])
+    file = EvaluationsFile(path)
+    assert file.has(200)
+    file.cut(1000, 2)
+    assert (file.has(100), file.has(200)) == (True, False)
+
+
+@pytest.mark.parametrize(
+    "row",
+    [
+        {},
+        {"steps": -1},
+        {"steps": 2.5},
+        {"steps": True},
+        {"return_mean": "9"},
+        {"return_mean": 1e400},
+        {"return_std": -1},
+    ],
+)
+def test_row_that_is_no_evaluation_is_ignored(row, tmp_path):
+    path = tmp_path / "evaluations.jsonl"
+    files.append_rows(path, [EVALUATIONS[0], {**EVALUATIONS[1], **row} if row else {}])
+    assert len(EvaluationsFile(path).rows) == 1
+
+
+def test_evaluation_with_a_diverged_seed_is_not_best(tmp_path):
+    path = tmp_path / "evaluations.jsonl"
+    files.append_rows(path, EVALUATIONS[:4])
+    file = EvaluationsFile(path)
+    means = enumerate((99.0, np.nan))
+    seeds = [{"seed": i, "return_mean": x, "return_std": 1.0, "returns": [x]} for i, x in means]
+    file.append(300, {"seeds": seeds})
+    assert file.best == EvaluationsFile(path).best == 200
+    file.cut(1000, 2)
+    assert file.best == EvaluationsFile(path).best == 200
+
+
+def test_checkpoint_is_on_disk_before_its_evaluation(state, tmp_path, monkeypatch):
+    seen, save = [], checkpoint.save
+
+    def slow(*args):
+        time.sleep(0.5)
+        seen.append((tmp_path / "evaluations.jsonl").read_bytes())
+        save(*args)
+
+    evaluation = {"seeds": [{"seed": 0, "return_mean": 1.0, "return_std": 0.0, "returns": [1.0]}]}
+    monkeypatch.setattr(checkpoint, "save", slow)
+    monkeypatch.setattr(logger, "evaluate_policies", lambda *_, **__: evaluation)
+    with RunLogger(tmp_path, SMALL, RunOptions(), 0) as run:
+        run.save(state)
+        run.evaluate(None, print)
+    assert seen == [b""]
+    assert [row["return_mean"] for row in run.evaluations.rows] == [1.0]
+
+
+@pytest.mark.parametrize("seeds", [1, 3])
+def test_learning_curve_shows_returns_and_evaluations(seeds, tmp_path):
+    steps, returns = 10 * np.arange(1, 20), np.log(np.arange(1.0, 20)[:, None] + np.arange(seeds))
+    returns[:3] = np.nan
+    dots = np.array([[100, 2.0, 0.5], [150, 3.0, 0.1]])
+    plots = {"none": (steps[:3], returns[:3], None), "curve": (steps, returns, None)}
+    plots["dots"] = (steps, returns, dots)
+    images = []
+    for name, (x, y, evaluations) in plots.items():
+        figure = metrics.learning_curve(x, y, "title", evaluations)
+        metrics.save_figure(figure, tmp_path / f"{name}.png")
+        images.append(imread(tmp_path / f"{name}.png")[..., :3])
+    legend = [text.get_text() for text in figure.axes[0].get_legend().get_texts()]
+    assert len(legend) == (2 if seeds == 1 else 3)
+
+    def share(image, *color):
+        return np.mean(np.abs(image - np.array(color) / 255).max(-1) < 0.1)
+
+    blue, orange = (31, 119, 180), (255, 127, 14)
+    assert [share(image, *blue) > 0.001 for image in images[1:]] == [True, True]
+    assert [share(image, *orange) > 0.0001 for image in images] == [False, False, True]
+
+
+def test_long_run_is_drawn_in_a_thousand_points():
+    steps = np.arange(1, 30_001)
+    line = metrics.learning_curve(steps, np.sqrt(steps)[:, None], "title").axes[0].lines[0]
+    x, y = (np.asarray(each) for each in line.get_data())
+    assert (len(x), x[0], x[-1]) == (1000, 1, 30_000)
+    np.testing.assert_array_equal(y, np.sqrt(x))

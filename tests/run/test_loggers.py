@@ -1,0 +1,319 @@
+"""Metric loggers, read back from what they wrote."""
+
+import dataclasses
+import importlib.util
+import json
+import struct
+from collections import Counter
+
+import numpy as np
+import pytest
+
+from dgae_jax.configs.config import ConfigError
+from dgae_jax.run import directory, loggers, metrics
+from dgae_jax.run.options import METRIC_LOGGERS, RunOptions, validate_options
+from dgae_jax.run.training import train_command
+from tests.runs import QUIET, SMALL, last, small, stopped_half_way, timeless
+
+SEEDS = 2
+
+
+def is_installed(name):
+    return importlib.util.find_spec(METRIC_LOGGERS[name]) is not None
+
+
+def needs(name):
+    reason = f"{METRIC_LOGGERS[name]} is not installed"
+    return pytest.mark.skipif(not is_installed(name), reason=reason)
+
+
+INSTALLED = tuple(filter(is_installed, METRIC_LOGGERS))
+READABLE = [pytest.param(name, marks=needs(name)) for name in METRIC_LOGGERS]
+ACCOUNTS = (
+    "WANDB_MODE",
+    "WANDB_API_KEY",
+    "WANDB_PROJECT",
+    "MLFLOW_TRACKING_URI",
+    "MLFLOW_EXPERIMENT_NAME",
+)
+
+
+@pytest.fixture(autouse=True, scope="module")
+def _no_accounts(tmp_path_factory):
+    """Nobody is logged in anywhere, and nothing is sent."""
+    home = tmp_path_factory.mktemp("home")
+    with pytest.MonkeyPatch.context() as patch:
+        for name in ACCOUNTS:
+            patch.delenv(name, raising=False)
+        patch.setenv("NETRC", str(home / "none"))
+        for name in ("WANDB_CONFIG_DIR", "WANDB_CACHE_DIR", "WANDB_DATA_DIR"):
+            patch.setenv(name, str(home))
+        patch.setenv("WANDB_ERROR_REPORTING", "false")
+        yield
+
+
+def events(run_dir, seed):
+    """Yield TensorBoard's events: length and its checksum, the event and its checksum."""
+    from tensorboardX.proto.event_pb2 import Event
+
+    for path in sorted((run_dir / "tensorboard" / f"seed_{seed}").iterdir()):
+        data = path.read_bytes()
+        while data:
+            (size,) = struct.unpack("<Q", data[:8])
+            yield Event.FromString(data[12 : 12 + size])
+            data = data[16 + size :]
+
+
+def read_tensorboard(run_dir, seed):
+    """Return what the viewer shows: a session that starts at a step hides later ones."""
+    from tensorboardX.proto.event_pb2 import SessionLog
+
+    found = []
+    for event in events(run_dir, seed):
+        if event.session_log.status == SessionLog.START:
+            found = [each for each in found if each[0] < event.step]
+        scalars = [v for v in event.summary.value if v.WhichOneof("value") == "simple_value"]
+        found += [(event.step, v.tag, v.simple_value) for v in scalars]
+    return found
+
+
+def records(path):
+    """Yield the records of a file of Weights & Biases, a LevelDB log in blocks of 32 KiB."""
+    data, at, parts = path.read_bytes(), 7, b""
+    while at < len(data):
+        left = 32768 - at % 32768
+        if left < 7:
+            at += left
+            continue
+        _, size, kind = struct.unpack("<IHB", data[at : at + 7])
+        parts, at = parts + data[at + 7 : at + 7 + size], at + 7 + size
+        if kind in (1, 4):  # whole, or the last part
+            yield parts
+            parts = b""
+
+
+def logger_id(run_dir, name, seed):
+    return json.loads((run_dir / "sinks.json").read_text())[name]["ids"][str(seed)]
+
+
+def read_wandb(run_dir, seed):
+    from wandb.proto.wandb_internal_pb2 import Record
+
+    found = []
+    name = logger_id(run_dir, "wandb", seed)
+    for path in sorted(run_dir.glob(f"wandb/offline-run-*/run-{name}.wandb")):
+        for record in map(Record.FromString, records(path)):
+            # an item with several keys is a picture
+            items = [item for item in record.history.item if len(item.nested_key) < 2]
+            row = {item.key or item.nested_key[0]: json.loads(item.value_json) for item in items}
+            names = [k for k in row if k != "steps" and not k.startswith("_")]
+            found += [(row["steps"], k, row[k]) for k in names]
+    return found
+
+
+def mlflow_client(run_dir):
+    from mlflow import MlflowClient
+
+    return MlflowClient(f"sqlite:///{run_dir / 'mlflow' / 'mlflow.db'}")
+
+
+def read_mlflow(run_dir, seed):
+    client, name = mlflow_client(run_dir), logger_id(run_dir, "mlflow", seed)
+    keys = client.get_run(name).data.metrics
+    return [(m.step, m.key, m.value) for k in keys for m in client.get_metric_history(name, k)]
+
+
+READ = {"tensorboard": read_tensorboard, "wandb": read_wandb, "mlflow": read_mlflow}
+
+
+def written(run_dir, seed):
+    """Return what the run's own files say, by step and name."""
+    found = {}
+    for row in metrics.read(run_dir / "metrics.jsonl"):
+        if row["seed"] == seed:
+            found |= {(row["steps"], k): x for k, x in row.items() if x is not None}
+    for row in metrics.read(run_dir / "evaluations.jsonl"):
+        if row["seed"] == seed:
+            names = "return_mean", "return_std"
+            found |= {(row["steps"], f"evaluation/{k}"): row[k] for k in names}
+    return {key: x for key, x in found.items() if key[1] not in ("steps", "seed")}
+
+
+def check(name, run_dir, seed, but=()):
+    """Compare a logger with the run's files: each number once, a float32 in TensorBoard."""
+    found, ours = READ[name](run_dir, seed), written(run_dir, seed)
+    assert Counter((step, key) for step, key, _ in found) == Counter(ours.keys())
+    kind = np.float32 if name == "tensorboard" else float
+    theirs = {(s, k): x for s, k, x in found if k not in but}
+    assert theirs == {(s, k): float(kind(x)) for (s, k), x in ours.items() if k not in but}
+
+
+def train(run_dir, config=None, **options):
+    options = options if "resume" in options else {"run_dir": run_dir, **options}
+    chosen = dataclasses.replace(QUIET, **options)
+    return train_command(config or small(seeds=SEEDS), chosen)
+
+
+@pytest.fixture(scope="module")
+def plain(tmp_path_factory):
+    """A run of two seeds without loggers."""
+    run_dir = tmp_path_factory.mktemp("runs") / "plain"
+    assert train(run_dir) == 0
+    return run_dir
+
+
+@pytest.fixture(scope="module")
+def logged(tmp_path_factory):
+    """The same run with all loggers that are installed."""
+    run_dir = tmp_path_factory.mktemp("runs") / "logged"
+    assert train(run_dir, log=INSTALLED) == 0
+    return run_dir
+
+
+@pytest.mark.parametrize("name", READABLE)
+def test_logger_has_every_number_once(name, logged):
+    for seed in range(SEEDS):
+        check(name, logged, seed)
+
+
+def test_loggers_change_no_bit(plain, logged):
+    assert last(logged).read_bytes() == last(plain).read_bytes()
+    assert timeless(logged) == timeless(plain)
+    ours, theirs = (d / "evaluations.jsonl" for d in (logged, plain))
+    assert ours.read_bytes() == theirs.read_bytes()
+    assert not (plain / "sinks.json").exists()
+
+
+@pytest.mark.parametrize("name", READABLE)
+def test_resumed_run_logs_each_step_once(name, logged, tmp_path):
+    run_dir = tmp_path / "half"
+    stopped_half_way(logged, run_dir)
+    assert directory.saved_options(run_dir).log == INSTALLED
+    assert train(run_dir, resume=run_dir, log=(name,)) == 0
+    # a logger that cannot go back has the times of the first attempt
+    kept = () if name in loggers.REWINDS else ("seconds",)
+    for seed in range(SEEDS):
+        check(name, run_dir, seed, but=kept)
+
+
+@pytest.mark.parametrize("name", READABLE)
+def test_logger_that_is_added_later_gets_what_came_before(name, plain, tmp_path):
+    run_dir = tmp_path / "half"
+    stopped_half_way(plain, run_dir)
+    assert train(run_dir, resume=run_dir, log=(name,)) == 0
+    for seed in range(SEEDS):
+        check(name, run_dir, seed)
+
+
+@needs("tensorboard")
+def test_tensorboard_has_configuration_and_curve(logged):
+    values = {v.tag: v for event in events(logged, 1) for v in event.summary.value}
+    text = values["configuration/text_summary"].tensor.string_val[0].decode()
+    assert "| policy.clip_eps | 0.2 |" in text
+    assert "| seed | 1 |" in text
+    image = values["curve.png"].image
+    assert image.encoded_image_string == (logged / "curve.png").read_bytes()
+    assert (image.width, image.height) == (960, 600)
+
+
+@needs("mlflow")
+def test_mlflow_has_configuration_curve_and_status(logged):
+    client = mlflow_client(logged)
+    found = client.search_runs([client.get_experiment_by_name("dgae_jax").experiment_id])
+    assert sorted(run.info.run_name for run in found) == ["logged-seed-0", "logged-seed-1"]
+    for run in found:
+        assert run.data.params["policy.clip_eps"] == "0.2"
+        assert run.data.params["seed"] == run.info.run_name[-1]
+        assert run.info.status == "FINISHED"
+        kept = {file.path for file in client.list_artifacts(run.info.run_id)}
+        assert kept == {"config.json", "curve.png"}
+    assert len(list((logged / "mlflow" / "files").rglob("curve.png"))) == SEEDS
+
+
+@needs("wandb")
+def test_wandb_stays_offline_without_login(logged):
+    assert len(list(logged.glob("wandb/offline-run-*"))) == SEEDS
+    assert list(logged.glob("wandb/offline-run-*/files/media/images/*.png"))
+
+
+class Failing:
+    """A logger whose method or opening `at` breaks."""
+
+    def __init__(self, calls, at):
+        self.calls, self.at = calls, at
+        self.take("open")
+
+    def take(self, name):
+        self.calls.append(name)
+        if name == self.at:
+            raise ConnectionError("the network is gone\nmore")
+
+    def rows(self, rows):
+        self.take("rows")
+
+    def evaluations(self, rows):
+        self.take("evaluations")
+
+    def close(self, paths, finished):
+        self.take("close")
+
+
+@pytest.mark.parametrize("at", ["open", "rows", "evaluations", "close"])
+def test_failing_logger_costs_one_warning(at, plain, tmp_path, capsys, monkeypatch):
+    run_dir, calls = tmp_path / "run", []
+    monkeypatch.setitem(loggers.LOGGERS, "tensorboard", lambda place: Failing(calls, at))
+    assert train(run_dir, log=("tensorboard",)) == 0
+    assert (calls.count(at), calls[-1]) == (1, at)
+    why = "ConnectionError: the network is gone"
+    rest = "the training goes on, and --resume adds what is missing"
+    assert capsys.readouterr().err == f"warning: --log tensorboard stops here ({why}); {rest}\n"
+    assert last(run_dir).read_bytes() == last(plain).read_bytes()
+
+
+@needs("tensorboard")
+def test_failed_logger_catches_up_after_resume(tmp_path, monkeypatch):
+    run_dir = tmp_path / "run"
+    with monkeypatch.context() as patch:
+        patch.setitem(loggers.LOGGERS, "tensorboard", lambda place: Failing([], "rows"))
+        assert train(run_dir, log=("tensorboard",)) == 0
+    assert not (run_dir / "tensorboard").exists()
+    steps = 10 * SMALL.samples_per_iteration
+    longer = dataclasses.replace(small(seeds=SEEDS), total_steps=steps)
+    assert train(run_dir, longer, resume=run_dir, log=("tensorboard",)) == 0
+    check("tensorboard", run_dir, 0)
+
+
+@pytest.mark.parametrize(
+    "found", [None, 3, [], {"ids": [1], "rows": "many", "evaluations": -1}, {"ids": {"0": 7}}]
+)
+def test_unreadable_progress_counts_as_nothing(found):
+    assert loggers._progress(found) == {"ids": {}, "rows": 0, "evaluations": 0}
+
+
+@pytest.mark.parametrize(
+    ("log", "message"),
+    [
+        (("visdom",), "log visdom: must be one or more of tensorboard, wandb, mlflow"),
+        (("tensorboard", "tensorboard"), "log tensorboard tensorboard: must be each logger once"),
+    ],
+)
+def test_unknown_or_repeated_logger_is_refused(log, message):
+    with pytest.raises(ConfigError, match=message):
+        validate_options(RunOptions(log=log), SMALL)
+
+
+@pytest.mark.parametrize("name", METRIC_LOGGERS)
+def test_missing_library_says_what_to_install(name, monkeypatch):
+    monkeypatch.setattr(importlib.util, "find_spec", lambda _: None)
+    package = METRIC_LOGGERS[name]
+    message = rf'log {name}: {package} is missing; pip install "dgae_jax\[{name}\]"'
+    with pytest.raises(ConfigError, match=message):
+        validate_options(RunOptions(log=(name,)), SMALL)
+
+
+def test_folder_of_its_name_is_not_a_library(tmp_path, monkeypatch):
+    (tmp_path / "a_logger_s_folder").mkdir()
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setitem(METRIC_LOGGERS, "wandb", "a_logger_s_folder")
+    with pytest.raises(ConfigError, match="a_logger_s_folder is missing"):
+        validate_options(RunOptions(log=("wandb",)), SMALL)

@@ -1,0 +1,218 @@
+"""Devices, processes, signals: on one machine, which stands for several hosts."""
+
+import importlib
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+
+import jax
+import numpy as np
+import pytest
+
+from dgae_jax.configs.config import ConfigError
+from dgae_jax.run import checkpoint, directory, runtime
+from dgae_jax.run.options import RunOptions, validate_options
+from dgae_jax.run.runtime import Signals, Stopped
+from tests.helpers import ROOT, TINY
+from tests.runs import SMALL, last, stopped_half_way, timeless
+
+FLAGS = [*TINY, "--total-steps", "512", "--checkpoint-every", "256", "--episodes", "1"]
+CACHE = TINY[-2:]
+
+
+def begun(*flags):
+    command = [sys.executable, ROOT / "experiments" / "train.py", *map(str, flags)]
+    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+
+
+def finished(processes):
+    return [(*process.communicate(timeout=300), process.returncode) for process in processes]
+
+
+def pair(*flags):
+    """Start both processes of a run, which meet on the loopback device."""
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        where = f"127.0.0.1:{free.getsockname()[1]}"
+    both = "--coordinator", where, "--num-processes", 2
+    return [begun(*both, "--process-id", i, *flags) for i in range(2)]
+
+
+@pytest.fixture(scope="module")
+def two_processes(tmp_path_factory):
+    run_dir = tmp_path_factory.mktemp("hosts") / "whole"
+    (out, err, code), (other_out, other_err, other) = finished(pair(*FLAGS, "--run-dir", run_dir))
+    assert (code, other) == (0, 0), err + other_err
+    assert f"files in {run_dir}" in out
+    assert "dgae_jax" not in other_out
+    return run_dir
+
+
+@pytest.fixture(scope="module")
+def two_devices(tmp_path_factory):
+    run_dir = tmp_path_factory.mktemp("devices") / "whole"
+    ((_, err, code),) = finished([begun(*FLAGS, "--devices", 2, "--run-dir", run_dir)])
+    assert code == 0, err
+    assert json.loads((run_dir / "manifest.json").read_text())["options"]["devices"] == 2
+    return run_dir
+
+
+def arrays(run_dir):
+    state, _ = checkpoint.latest_train_state(run_dir, directory.read_config(run_dir))
+    return checkpoint.arrays_of(state)
+
+
+def test_two_processes_compute_what_two_devices_do(two_processes, two_devices):
+    ours, theirs = arrays(two_processes), arrays(two_devices)
+    for name, x in theirs.items():
+        np.testing.assert_allclose(ours[name], x, atol=1e-5, err_msg=name)
+    texts = [(d / "evaluation.json").read_text() for d in (two_processes, two_devices)]
+    np.testing.assert_allclose(*(json.loads(text)["returns"] for text in texts), rtol=1e-5)
+
+
+@pytest.mark.slow
+def test_two_processes_resume_bit_for_bit(two_processes, tmp_path):
+    half = tmp_path / "half"
+    stopped_half_way(two_processes, half)
+    for _, err, code in finished(pair("--resume", half, *CACHE)):
+        assert code == 0, err
+    assert last(half).read_bytes() == last(two_processes).read_bytes()
+    assert timeless(half) == timeless(two_processes)
+
+
+@pytest.mark.slow
+def test_two_devices_resume_bit_for_bit_and_one_is_refused(two_devices, tmp_path):
+    half = tmp_path / "half"
+    stopped_half_way(two_devices, half)
+    ((_, err, code),) = finished([begun("--resume", half, "--devices", "1", *CACHE)])
+    assert code == 2
+    assert "with --inexact; now devices 1 (was 2)" in err
+    ((_, err, code),) = finished([begun("--resume", half, *CACHE)])
+    assert code == 0, err
+    assert last(half).read_bytes() == last(two_devices).read_bytes()
+    assert timeless(half) == timeless(two_devices)
+
+
+@pytest.mark.slow
+def test_signal_to_any_process_stops_all_with_one_checkpoint(tmp_path):
+    run_dir = tmp_path / "run"
+    processes = pair(*TINY, "--total-steps", "100_000_000", "--run-dir", run_dir)
+    rows = run_dir / "metrics.jsonl"
+    while not rows.exists() or not rows.stat().st_size:
+        time.sleep(0.2)
+        assert all(process.poll() is None for process in processes), finished(processes)
+    processes[1].send_signal(signal.SIGTERM)
+    (out, _, code), (_, _, other) = finished(processes)
+    assert (code, other) == (143, 143)
+    assert f"stopped by SIGTERM; continue with --resume {run_dir}" in out
+    (saved,) = (run_dir / "checkpoints").iterdir()
+    assert saved.name == f"steps_{timeless(run_dir)[-1]['steps']:012d}.msgpack"
+
+
+@pytest.mark.parametrize("devices", [3, 0])
+def test_uneven_number_of_devices_is_refused(devices, tmp_path):
+    run_dir = tmp_path / "run"
+    ((_, err, code),) = finished([begun(*TINY, "--devices", devices, "--run-dir", run_dir)])
+    assert code == 2
+    assert f"devices {devices}: must be a " in err
+    assert not run_dir.exists()
+
+
+@pytest.mark.parametrize(
+    ("options", "reason"),
+    [
+        ({"coordinator": "here"}, "coordinator here: must be HOST:PORT"),
+        (
+            {"coordinator": "localhost:1", "num_processes": 2},
+            "process_id None: must be given with --coordinator",
+        ),
+        (
+            {"coordinator": "localhost:1", "num_processes": 2, "process_id": 2},
+            "process_id 2: must be below --num-processes 2",
+        ),
+        ({"num_processes": 2}, "num_processes 2: must be left out without --coordinator"),
+        ({"process_id": 0}, "process_id 0: must be left out without --coordinator"),
+    ],
+)
+def test_incomplete_process_options_are_refused(options, reason):
+    with pytest.raises(ConfigError, match=f"^{reason}$"):
+        validate_options(RunOptions(**options), SMALL)
+
+
+SCHEDULERS = (
+    "SLURM_NTASKS",
+    "OMPI_COMM_WORLD_SIZE",
+    "TPU_WORKER_HOSTNAMES",
+    "KUBERNETES_SERVICE_HOST",
+    "JOB_COMPLETION_INDEX",
+)
+
+
+@pytest.mark.parametrize(
+    ("environment", "several"),
+    [
+        ({}, False),
+        ({"SLURM_NTASKS": "1"}, False),
+        ({"SLURM_NTASKS": "2"}, True),
+        ({"OMPI_COMM_WORLD_SIZE": "4"}, True),
+        ({"TPU_WORKER_HOSTNAMES": "one"}, False),
+        ({"TPU_WORKER_HOSTNAMES": "one,two"}, True),
+        ({"KUBERNETES_SERVICE_HOST": "here"}, False),
+        ({"KUBERNETES_SERVICE_HOST": "here", "JOB_COMPLETION_INDEX": "0"}, True),
+    ],
+)
+def test_processes_of_a_scheduler_are_joined(environment, several, monkeypatch):
+    for name in SCHEDULERS:
+        monkeypatch.delenv(name, raising=False)
+    for name, value in environment.items():
+        monkeypatch.setenv(name, value)
+    met = []
+    monkeypatch.setattr(jax.distributed, "initialize", lambda *where: met.append(where))
+    runtime.join_processes(RunOptions())
+    assert met == ([(None, None, None)] if several else [])
+    runtime.join_processes(RunOptions(num_processes=1))
+    assert len(met) == several
+
+
+@pytest.mark.parametrize(
+    ("wanted", "reason", "said"),
+    [
+        ("cuda", AssertionError(), r"dgae_jax\[cuda13\].*; JAX says: AssertionError$"),
+        ("abacus", RuntimeError("Unknown backend"), r"cuda13.*; JAX says: Unknown backend$"),
+        ("cpu", ImportError("no jaxlib"), r"cpu for one; JAX says: no jaxlib$"),
+    ],
+)
+def test_missing_device_says_what_to_install(wanted, reason, said, monkeypatch):
+    def devices():
+        raise reason
+
+    monkeypatch.setattr(jax, "devices", devices)
+    monkeypatch.setenv("JAX_PLATFORMS", wanted)
+    with pytest.raises(ConfigError, match=rf"^JAX_PLATFORMS={wanted}: must name a device .*{said}"):
+        runtime.use_devices(SMALL, RunOptions())
+
+
+def test_signal_during_import_stops_the_work_afterwards(monkeypatch, tmp_path, capfd):
+    program = "import os, signal\nos.kill(os.getpid(), signal.SIGTERM)\nwhole = True\n"
+    (tmp_path / "signalled.py").write_text(program)
+    monkeypatch.syspath_prepend(tmp_path)
+    told = []
+    with Signals() as signals, signals.may_stop(told.append) as watch:
+        watch("before")
+        assert importlib.import_module("signalled").whole
+        with pytest.raises(Stopped):
+            watch("after")
+    assert (told, signals.name, signals.exit_code) == (["before"], "SIGTERM", 143)
+    assert capfd.readouterr().err == ""
+
+
+def test_signal_is_recorded_until_work_may_stop(capfd):
+    with Signals() as signals:
+        os.kill(os.getpid(), signal.SIGTERM)
+        with pytest.raises(Stopped), signals.may_stop():
+            pytest.fail("nothing is begun")
+    assert capfd.readouterr().err.startswith("SIGTERM: finishing the running dispatch")
