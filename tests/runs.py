@@ -12,7 +12,7 @@ from dgae_jax.run.options import RunOptions
 from tests import helpers
 
 SMALL = resolve(helpers.SMALL)
-"""As a run has it, with everything written out."""
+"""The small configuration, resolved."""
 
 ITERATIONS = 8
 QUIET = RunOptions(
@@ -23,7 +23,7 @@ QUIET = RunOptions(
 
 
 def small(algo="ppo", physics="native", seeds=1):
-    """The small run of an algorithm, resolved as a run has it."""
+    """Return the small run of an algorithm, resolved."""
     shape = {
         "total_steps": ITERATIONS * SMALL.samples_per_iteration,
         "episode_length": 20,
@@ -33,7 +33,7 @@ def small(algo="ppo", physics="native", seeds=1):
 
 
 def saved(state, directory, steps, **keep):
-    """A checkpoint of `state` after so many samples."""
+    """Save a checkpoint of `state` after so many samples."""
     then = state._replace(
         iteration=jnp.full_like(state.iteration, steps // SMALL.samples_per_iteration)
     )
@@ -52,7 +52,7 @@ def last(run_dir):
 
 
 def stopped_half_way(whole, half):
-    """A copy of a finished run as a crash after its first checkpoint would have left it, a torn line included."""
+    """Copy a finished run as a crash after its first checkpoint would have left it."""
     shutil.copytree(whole, half)
     last(half).unlink()
     (half / "evaluation.json").unlink()

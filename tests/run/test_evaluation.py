@@ -84,10 +84,11 @@ def test_evaluation_reports_progress_and_can_be_broken_off():
             raise KeyboardInterrupt
 
     config = dataclasses.replace(SMALL, env="swimmer")  # which never falls
+    swimmers = policies(config)
     for engine in ENGINES:
+        how = {"engine": engine, "episodes": 2, "watch": watch}
         with pytest.raises(KeyboardInterrupt):
-            how = {"engine": engine, "episodes": 2, "watch": watch}
-            evaluate_policies(policies(config), config, **how)
+            evaluate_policies(swimmers, config, **how)
         start = f"evaluating 2 episodes in Swimmer-v4 ({engine}): step "
         assert said[-2:] == [f"{start}{n} of at most 1,000, 2 still running" for n in (0, 50)]
 

@@ -1,25 +1,24 @@
 """Metrics, evaluations and the learning curve."""
 
+import dataclasses
 import time
 
 import numpy as np
 import pytest
 from matplotlib.image import imread
 
-import dgae_jax as dg
 from dgae_jax.configs.config import ConfigError
-from dgae_jax.configs.resolved import resolve
 from dgae_jax.run import checkpoint, files, logger, metrics
 from dgae_jax.run.logger import RunLogger
 from dgae_jax.run.metrics import EvaluationsFile, MetricsFile
 from dgae_jax.run.options import RunOptions
 from tests.runs import SMALL
 
-CONFIG = resolve(dg.Config(num_envs=10, num_steps=10))
+CONFIG = dataclasses.replace(SMALL, num_envs=10, num_steps=10)
 
 
 def test_one_row_per_iteration_and_seed(tmp_path):
-    config = resolve(dg.Config(seed=7, num_seeds=2, num_envs=10, num_steps=10))
+    config = dataclasses.replace(CONFIG, seed=7, num_seeds=2)
     path = tmp_path / "metrics.jsonl"
     file = MetricsFile(path, config, 0)
     returns = np.array([[1.5, np.nan], [2.0, 3.0], [0, 0]])

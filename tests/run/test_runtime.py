@@ -66,6 +66,7 @@ def arrays(run_dir):
     return checkpoint.arrays_of(state)
 
 
+@pytest.mark.slow
 def test_two_processes_compute_what_two_devices_do(two_processes, two_devices):
     ours, theirs = arrays(two_processes), arrays(two_devices)
     for name, x in theirs.items():
