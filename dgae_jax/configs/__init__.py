@@ -1,4 +1,4 @@
-"""What a run is: the configuration as a user writes it, the resolved one, presets and their checks.
+"""Configurations of runs, as a user writes them and resolved; presets and checks.
 
 Nothing here imports JAX, so that a command line is checked before JAX is loaded.
 """

@@ -63,7 +63,7 @@ class ResolvedCritic(Settings):
 
     @property
     def is_distribution(self) -> bool:
-        """Whether the critic predicts quantiles."""
+        """True if the critic predicts quantiles."""
         return "quantiles" in self.options
 
     @property

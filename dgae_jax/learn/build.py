@@ -1,4 +1,4 @@
-"""From a configuration to what it names: task, networks, algorithm, training step, programs."""
+"""Tasks, networks, algorithms and training steps of a configuration; registration of parts."""
 
 import dataclasses
 from collections.abc import Callable

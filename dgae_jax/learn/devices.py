@@ -4,7 +4,7 @@ Envs are divided over the devices, and each rolls out its own without communicat
 gathered on all of them, and each computes the estimates. Of the policy's and the critic's update
 
 - each has a CPU device of its own, because there a gradient step is too short to be shared;
-- accelerators share every minibatch, whose gradient XLA sums over them.
+- accelerators share every minibatch, and XLA sums its gradient over them.
 
 Several seeds are divided instead, if their number allows it: then nothing is communicated at all.
 """

@@ -1,4 +1,4 @@
-"""How much memory a run takes, estimated before anything is compiled or allocated.
+"""Memory of a run, estimated before anything is compiled or allocated.
 
 Counted are the arrays that exist at the same time: the training state before and after, one rollout
 with what is computed from it, and the activations of a gradient step. XLA's own buffers come on

@@ -178,7 +178,7 @@ class Critic(NamedTuple):
 
 
 class Update(NamedTuple):
-    """How a network is updated."""
+    """Update of a network."""
 
     init: InitOptimizer
     step: UpdateStep

@@ -256,7 +256,7 @@ def a2c_update(policy: Policy, iterations: ArrayLike, **fit) -> Update:
 def trpo_update(
     policy: Policy, iterations: ArrayLike, *, max_kl: ArrayLike, learning_rate_end, **search
 ) -> Update:
-    """TRPO: a natural gradient step on the surrogate, whose max_kl decays at the end of the run."""
+    """TRPO: a natural gradient step on the surrogate; max_kl decays at the end of the run."""
     schedule = linear_schedule(max_kl, learning_rate_end, iterations, RADIUS_DECAY_START)
     return trust_region(policy, surrogate(policy), max_kl=schedule, **search)
 

@@ -1,1 +1,1 @@
-"""The paper's mathematics as pure functions of arrays: distributions, estimators, the normal distribution, statistics, preferences."""
+"""The paper's mathematics as pure functions of arrays; statistics and risk measures."""

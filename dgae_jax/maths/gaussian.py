@@ -1,4 +1,4 @@
-"""The diagonal normal distribution of actions; the last axis is the action."""
+"""Normal distributions of actions with diagonal covariance; the last axis is the action."""
 
 import math
 from typing import NamedTuple
@@ -16,13 +16,13 @@ class Gaussian(NamedTuple):
 
 
 def sample(key: Key[Array, ""], distribution: Gaussian) -> Float[Array, "*batch A"]:
-    """mean + σ·ε with ε ~ N(0, I)."""
+    """Draw mean + σ·ε with ε ~ N(0, I)."""
     mean, log_std = distribution
     return mean + jnp.exp(log_std) * jax.random.normal(key, mean.shape, mean.dtype)
 
 
 def log_prob(distribution: Gaussian, action: Float[Array, "*batch A"]) -> Float[Array, "*batch"]:
-    """log π(a) = −Σ [½((a − mean)/σ)² + log σ + ½ log 2π]."""
+    """Compute log π(a) = −Σ [½((a − mean)/σ)² + log σ + ½ log 2π]."""
     mean, log_std = distribution
     return -(
         0.5 * ((action - mean) * jnp.exp(-log_std)) ** 2 + log_std + 0.5 * math.log(2 * math.pi)
@@ -30,12 +30,12 @@ def log_prob(distribution: Gaussian, action: Float[Array, "*batch A"]) -> Float[
 
 
 def entropy(distribution: Gaussian) -> Float[Array, "*batch"]:
-    """H = Σ [log σ + ½ log 2πe], in nats."""
+    """Compute the entropy Σ [log σ + ½ log 2πe] [nats]."""
     return (distribution.log_std + 0.5 * math.log(2 * math.pi * math.e)).sum(-1)
 
 
 def kl(p: Gaussian, q: Gaussian) -> Float[Array, "*batch"]:
-    """KL(p ‖ q) = Σ [log σ_q/σ_p + (σ_p² + (μ_p − μ_q)²) / 2σ_q² − ½], in nats."""
+    """Compute KL(p ‖ q) = Σ [log σ_q/σ_p + (σ_p² + (μ_p − μ_q)²) / 2σ_q² − ½] [nats]."""
     log_ratio = q.log_std - p.log_std
     distance = (p.mean - q.mean) * jnp.exp(-q.log_std)
     return (log_ratio + 0.5 * (jnp.exp(-2 * log_ratio) + distance**2 - 1)).sum(-1)

@@ -1,8 +1,14 @@
-"""From rewards and value predictions to advantages and critic targets, over the leading time axis.
+"""Advantages and critic targets from rewards and value predictions, over the leading time axis.
 
-Two masks with two roles: `terminated` ends the bootstrap, `done = terminated | truncated` cuts the trace. They appear
-as discountₜ = γ(1 − terminatedₜ) and traceₜ = λ(1 − doneₜ), so that γλ(1 − doneₜ) = discountₜ·traceₜ. `next_…` are
-predictions at the true successor, so neither time limits nor the end of the rollout need a special case.
+Two masks have two roles: `terminated` ends the bootstrap, `done = terminated | truncated` cuts the
+trace. The functions share these arguments, where T are time steps and K quantiles:
+
+    reward: rewards [T, ...].
+    quantiles: predictions [T, ..., K] before each step.
+    next_quantiles: predictions [T, ..., K] for the true successor of each step, so that neither
+        time limits nor the end of a rollout need a special case.
+    discount: γ(1 − terminated) [T, ...].
+    trace: λ(1 − done) [T, ...], so that γλ(1 − done) = discount · trace.
 """
 
 from typing import NamedTuple
@@ -17,14 +23,14 @@ Mask = Bool[Array, "T *batch"] | Float[Array, "T *batch"]
 
 
 class Decay(NamedTuple):
-    """The factors of the bootstrap, γ(1 − terminated), and of the trace, λ(1 − done)."""
+    """Factors of the bootstrap, γ(1 − terminated), and of the trace, λ(1 − done)."""
 
     discount: Float[Array, "T *batch"]
     trace: Float[Array, "T *batch"]
 
 
 def decay(terminated: Mask, truncated: Mask, *, gamma: ArrayLike, lam: ArrayLike) -> Decay:
-    """The two masks as the two factors every estimator below is written in."""
+    """Return the two factors of the estimators below, for γ and λ from 0 to 1."""
     done = jnp.logical_or(terminated, truncated)
     return Decay(
         jnp.multiply(gamma, 1.0 - jnp.asarray(terminated, float)),
@@ -35,14 +41,24 @@ def decay(terminated: Mask, truncated: Mask, *, gamma: ArrayLike, lam: ArrayLike
 def lambda_sum(
     delta: Float[Array, "T *batch"], factor: Float[Array, "T *batch"]
 ) -> Float[Array, "T *batch"]:
-    """Aₜ = δₜ + factorₜ Aₜ₊₁, A_T = 0, so Aₜ = Σₖ (γλ)ᵏ δₜ₊ₖ within an episode (Theorem, Eq. gae_final)."""
+    """Compute Aₜ = δₜ + factorₜ Aₜ₊₁ with A_T = 0 (Theorem, Eq. gae_final).
 
-    def back(advantage, step):
-        residual, factor = step
-        advantage = residual + factor * advantage
+    Within an episode it is Σₖ (γλ)ᵏ δₜ₊ₖ.
+
+    Args:
+        delta: TD errors δ [T, ...].
+        factor: γλ(1 − done) [T, ...].
+
+    Returns:
+        Advantages [T, ...].
+    """
+
+    def backward(advantage, step):
+        delta, factor = step
+        advantage = delta + factor * advantage
         return advantage, advantage
 
-    return jax.lax.scan(back, jnp.zeros_like(delta[0]), (delta, factor), reverse=True)[1]
+    return jax.lax.scan(backward, jnp.zeros_like(delta[0]), (delta, factor), reverse=True)[1]
 
 
 def td_residual(
@@ -51,7 +67,7 @@ def td_residual(
     value: Float[Array, "*batch"],
     next_value: Float[Array, "*batch"],
 ) -> Float[Array, "*batch"]:
-    """δ = r + γ V(s′) − V(s) (below Eq. GAE)."""
+    """Compute the TD error δ = r + γ V(s′) − V(s) (below Eq. GAE)."""
     return reward + discount * next_value - value
 
 
@@ -62,7 +78,11 @@ def distributional_td_residual(
     next_quantiles: Float[Array, "*batch K"],
     weights: ArrayLike | None = None,
 ) -> Float[Array, "*batch"]:
-    """δ^G = r + d(γ G(s′), G(s)) (Def. distributional_TD_error)."""
+    """Compute the distributional TD error r + d(γ G(s′), G(s)) (Def. distributional_TD_error).
+
+    Returns:
+        TD errors δ [...]; for `weights` see `transport.directional_metric`.
+    """
     return reward + directional_metric(discount[..., None] * next_quantiles, quantiles, weights)
 
 
@@ -76,7 +96,20 @@ def gae(
     gamma: ArrayLike,
     lam: ArrayLike,
 ) -> Float[Array, "T *batch"]:
-    """Â = Σₖ (γλ)ᵏ δₜ₊ₖ with the scalar TD error (Eq. GAE; Schulman et al. 2016)."""
+    """Compute Â = Σₖ (γλ)ᵏ δₜ₊ₖ with the scalar TD error (Eq. GAE; Schulman et al. 2016).
+
+    Args:
+        reward: rewards [T, ...].
+        value: V(s) [T, ...].
+        next_value: V(s′) [T, ...] of the true successor.
+        terminated: the task ended: what follows is worth 0.
+        truncated: the episode was cut: what follows keeps its value.
+        gamma: discount factor γ.
+        lam: λ of the trace.
+
+    Returns:
+        Advantages [T, ...].
+    """
     discount, trace = decay(terminated, truncated, gamma=gamma, lam=lam)
     return lambda_sum(td_residual(reward, discount, value, next_value), discount * trace)
 
@@ -92,9 +125,22 @@ def dgae(
     lam: ArrayLike,
     weights: ArrayLike | None = None,
 ) -> Float[Array, "T *batch"]:
-    """Â_DGAE = Σₖ (γλ)ᵏ δ^Ĝₜ₊ₖ with the distributional TD error (Theorem, Eq. gae_final).
+    """Compute Â_DGAE = Σₖ (γλ)ᵏ δ^Ĝₜ₊ₖ with the distributional TD error (Theorem, Eq. gae_final).
 
     With the paper's L(x) = x (`weights=None`) this equals `gae` on the means of the quantiles.
+
+    Args:
+        reward: rewards [T, ...].
+        quantiles: Ĝ(s) [T, ..., K].
+        next_quantiles: Ĝ(s′) [T, ..., K] of the true successor.
+        terminated: the task ended: what follows is worth 0.
+        truncated: the episode was cut: what follows keeps its value.
+        gamma: discount factor γ.
+        lam: λ of the trace.
+        weights: see `transport.directional_metric`.
+
+    Returns:
+        Advantages [T, ...].
     """
     discount, trace = decay(terminated, truncated, gamma=gamma, lam=lam)
     return lambda_sum(
@@ -114,22 +160,27 @@ def n_step_advantage(
     n: int,
     weights: ArrayLike | None = None,
 ) -> Float[Array, "T *batch"]:
-    """Â⁽ⁿ⁾ = d(r(τ) + γⁿ Ĝ(sₜ₊ₙ), Ĝ(sₜ)), r(τ) = Σₖ₍ₖ<ₙ₎ γᵏ rₜ₊ₖ (Def. k_step_estimator).
+    """Compute Â⁽ⁿ⁾ = d(Σₖ₍ₖ<ₙ₎ γᵏ rₜ₊ₖ + γⁿ Ĝ(sₜ₊ₙ), Ĝ(sₜ)) (Def. k_step_estimator).
 
-    A trajectory that ends earlier, by episode or rollout, uses the steps it has.
+    A trajectory that ends earlier, by episode or rollout, uses the steps that it has.
+    Arguments are those of `dgae`, and the number of steps n ≥ 1.
+
+    Returns:
+        Advantages [T, ...].
     """
     if n < 1:
         raise ValueError(f"the number of steps n is {n}; it must be at least 1")
-    discount, go_on = (x[..., None] for x in decay(terminated, truncated, gamma=gamma, lam=1.0))
+    factors = decay(terminated, truncated, gamma=gamma, lam=1.0)
+    discount, continues = (x[..., None] for x in factors)
     successor = next_quantiles
     for _ in range(n - 1):
         n_step = reward[..., None] + discount * successor
         later = jnp.concatenate([n_step[1:], next_quantiles[-1:]])
-        successor = jnp.where(go_on > 0, later, next_quantiles)
+        successor = jnp.where(continues > 0, later, next_quantiles)
     return directional_metric(reward[..., None] + discount * successor, quantiles, weights)
 
 
-# ---- critic targets, from predictions of the critic that acted ----
+# ---- critic targets, from predictions of the critic at rollout time ----
 
 
 def bellman_target(
@@ -137,7 +188,11 @@ def bellman_target(
     discount: Float[Array, "*batch"],
     next_quantiles: Float[Array, "*batch K"],
 ) -> Float[Array, "*batch K"]:
-    """𝒯G(s) = r + γ G(s′), atom by atom (Eq. G_dis_bellman; Lemma lemma1 with η = γ ≥ 0)."""
+    """Compute 𝒯G(s) = r + γ G(s′), atom by atom (Eq. G_dis_bellman; Lemma lemma1 with η = γ).
+
+    Returns:
+        Targets [..., K].
+    """
     return reward[..., None] + discount[..., None] * next_quantiles
 
 
@@ -148,7 +203,11 @@ def lambda_return(
     quantiles: Float[Array, "T *batch K"],
     next_quantiles: Float[Array, "T *batch K"],
 ) -> Float[Array, "T *batch"]:
-    """The λ-return G^λ = V + Â_GAE, with V the mean of the quantiles (Schulman et al. 2016)."""
+    """Compute the λ-return G^λ = V + Â_GAE, V the mean of the quantiles (Schulman et al. 2016).
+
+    Returns:
+        λ-returns [T, ...].
+    """
     value = quantiles.mean(-1)
     delta = td_residual(reward, discount, value, next_quantiles.mean(-1))
     return value + lambda_sum(delta, discount * trace)
@@ -161,7 +220,11 @@ def lambda_shift_target(
     quantiles: Float[Array, "T *batch K"],
     next_quantiles: Float[Array, "T *batch K"],
 ) -> Float[Array, "T *batch K"]:
-    """The one-step target's shape, moved to the λ-return's mean: 𝒯G − E[𝒯G] + G^λ."""
+    """Compute 𝒯G − E[𝒯G] + G^λ, the one-step target shifted to the mean of the λ-return.
+
+    Returns:
+        Targets [T, ..., K].
+    """
     one_step = bellman_target(reward, discount, next_quantiles)
     mean = lambda_return(reward, discount, trace, quantiles, next_quantiles)
     return one_step - one_step.mean(-1, keepdims=True) + mean[..., None]
@@ -174,18 +237,20 @@ def sr_lambda_target(
     trace: Float[Array, "T *batch"],
     next_quantiles: Float[Array, "T *batch K"],
 ) -> Float[Array, "T *batch K"]:
-    """SR(λ), sample replacement: yₜ = r + γ·(yₜ₊₁ with probability traceₜ, else Ĝ(sₜ₊₁)), atom by atom, backwards.
+    """Sample SR(λ): yₜ = r + γ·(yₜ₊₁ with probability traceₜ, else Ĝ(sₜ₊₁)), atom by atom.
 
-    In expectation over the coin flips the atoms are drawn from the geometric mixture of the n-step return
-    distributions, and their mean is the λ-return (Nam et al. 2021, GMAC).
+    In expectation over the coin flips the atoms come from the geometric mixture of the n-step
+    return distributions, and their mean is the λ-return (sample replacement; Nam et al. 2021).
+
+    Returns:
+        Targets [T, ..., K].
     """
-    follow = jax.random.uniform(key, next_quantiles.shape) < trace[..., None]
+    continues = jax.random.uniform(key, next_quantiles.shape) < trace[..., None]
 
-    def back(later, step):
-        reward, discount, quantiles, follow = step
-        target = bellman_target(reward, discount, jnp.where(follow, later, quantiles))
+    def backward(later, step):
+        reward, discount, quantiles, continues = step
+        target = bellman_target(reward, discount, jnp.where(continues, later, quantiles))
         return target, target
 
-    return jax.lax.scan(
-        back, next_quantiles[-1], (reward, discount, next_quantiles, follow), reverse=True
-    )[1]
+    steps = reward, discount, next_quantiles, continues
+    return jax.lax.scan(backward, next_quantiles[-1], steps, reverse=True)[1]

@@ -1,7 +1,8 @@
-"""Risk preferences as spectral weights over the quantiles of a value distribution.
+"""Risk measures as spectral weights over the quantiles of a value distribution.
 
-A preference is a distortion D: [0, 1] → [0, 1], increasing, D(0) = 0, D(1) = 1; its weights are the increments of D over
-K equal cells, times K. Their mean is D(1) = 1, so that the directional metric stays translation and scale equivariant.
+A risk measure is a distortion D: [0, 1] → [0, 1], increasing, with D(0) = 0 and D(1) = 1. Its
+weights are the increments of D over K equal cells, times K. Their mean is D(1) = 1, so that the
+directional metric stays translation and scale equivariant.
 """
 
 from collections.abc import Callable
@@ -14,7 +15,11 @@ from numpy.typing import ArrayLike
 
 
 def check_spectral(weights: ArrayLike) -> np.ndarray:
-    """The weights [K] as they are; raises ValueError unless w ≥ 0 and ∫ w(q) dq = 1, that is mean(w) = 1 over the midpoints."""
+    """Return the weights [K] of a spectral risk measure.
+
+    Raises:
+        ValueError: unless w ≥ 0 and ∫ w(q) dq = 1, the mean over the midpoints.
+    """
     w = np.asarray(weights, np.float64)
     if w.ndim != 1 or (w < 0).any() or not abs(w.mean() - 1) < 1e-5:
         found = f"shape {w.shape}, minimum {w.min():g}, mean {w.mean():g}"
@@ -25,7 +30,7 @@ def check_spectral(weights: ArrayLike) -> np.ndarray:
 
 
 class Metric(NamedTuple):
-    """A family of preferences: its parameters, what they may be, and its weights."""
+    """A family of risk measures: its parameters, what they may be, and its weights."""
 
     parameters: tuple[str, ...]
     allowed: Callable[..., bool]
@@ -40,23 +45,26 @@ def _cells(distortion: Callable[[float], float], k: int) -> Float[np.ndarray, " 
 
 
 def cvar(k: int, alpha: float) -> Float[np.ndarray, " K"]:
-    """Conditional value at risk: the mean of the worst share α (Rockafellar & Uryasev 2000)."""
+    """Compute the weights of CVaR, the mean of the worst share α (Rockafellar & Uryasev 2000)."""
     return _cells(lambda q: min(q / alpha, 1.0), k)
 
 
 def wang(k: int, beta: float) -> Float[np.ndarray, " K"]:
-    """D(q) = Φ(Φ⁻¹(q) + β): averse to risk for β > 0 (Wang 2000)."""
+    """Compute the weights of D(q) = Φ(Φ⁻¹(q) + β), risk-averse for β > 0 (Wang 2000)."""
     normal = NormalDist()
     return _cells(lambda q: normal.cdf(normal.inv_cdf(q) + beta), k)
 
 
 def power(k: int, c: float) -> Float[np.ndarray, " K"]:
-    """D(q) = 1 − (1 − q)ᶜ: for a whole c the expected minimum of c draws; seeking risk for c < 1 (proportional hazard)."""
+    """Compute the weights of D(q) = 1 − (1 − q)ᶜ, the proportional hazard.
+
+    For a whole c it is the expected minimum of c draws; for c < 1 it seeks risk.
+    """
     return _cells(lambda q: 1 - (1 - q) ** c, k)
 
 
 def mean_cvar(k: int, alpha: float, weight: float) -> Float[np.ndarray, " K"]:
-    """`weight` parts of CVaR and the rest the mean."""
+    """Compute the weights of `weight` parts of CVaR and 1 − `weight` parts of the mean."""
     return weight * cvar(k, alpha) + (1 - weight)
 
 
@@ -72,18 +80,26 @@ METRICS = {
         mean_cvar,
     ),
 }
-"""User preferences join here: `METRICS["mine"] = Metric((), lambda: True, "", lambda k: weights)`."""
+"""Add your own: `METRICS["mine"] = Metric((), lambda: True, "", lambda k: weights)`."""
 
 
 def forms() -> str:
-    """How the known metrics are written."""
+    """Return how the known metrics are written."""
     return ", ".join(":".join((name, *metric.parameters)) for name, metric in METRICS.items())
 
 
 def weights_of(metric: str, k: int) -> Float[np.ndarray, " K"] | None:
-    """The weights that `NAME:PARAMETER:…` asks for over K quantiles; None for the mean, the paper's metric.
+    """Return the weights of a risk measure.
 
-    Raises ValueError, saying what is allowed, for anything else, and for weights that are negative or not of mean 1.
+    Args:
+        metric: `NAME:PARAMETER:…`, such as `cvar:0.25`; the names are those of `METRICS`.
+        k: number of quantiles K.
+
+    Returns:
+        The weights [K]; None for `mean`, the paper's metric.
+
+    Raises:
+        ValueError: the metric does not exist, or its weights are negative or not of mean 1.
     """
     if metric == "mean":
         return None
@@ -92,7 +108,7 @@ def weights_of(metric: str, k: int) -> Float[np.ndarray, " K"] | None:
 
 
 def check_metric(metric: str) -> None:
-    """Raise ValueError, saying what is allowed, for a metric that does not exist or parameters out of range."""
+    """Raise ValueError for a metric that does not exist or parameters out of range."""
     if metric != "mean":
         _parsed(metric)
 
