@@ -1,8 +1,8 @@
-"""Everything that needs an accelerator, in one run of a few minutes: benchmarks/gpu.sh installs and runs it.
+"""All measurements that need an accelerator, in one run of a few minutes; see benchmarks/gpu.sh.
 
-The step of every task on the device against the same step on the CPU; the speed of each engine; training at several numbers of worlds and
-seeds, with its seconds of compiling and its memory. What is measured is written at once, so that a run that is cut off leaves
-what it has.
+They are one step of every task against the same step on the CPU, the speed of each engine, and
+training with several numbers of envs and seeds, with seconds to compile and memory. Each is written
+at once, so that a run that is cut off keeps what it has.
 """
 
 import json
@@ -16,9 +16,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import physics
+import tyro
 
 import dgae_jax as dg
-from dgae_jax.cli import parse
 from dgae_jax.configs.resolved import resolve
 from dgae_jax.envs.registry import TASKS
 from dgae_jax.learn.build import make_task, make_trainer, seed_keys
@@ -33,60 +33,56 @@ class Arguments:
     seconds: float = 2.0
     """Length of a measurement [s]."""
     limit: float = 450.0
-    """Begin nothing more after so long [s]."""
+    """Time after which no measurement begins [s]."""
     tasks: tuple[str, ...] = tuple(TASKS)
     """Tasks to step; training is on the first."""
     engines: tuple[str, ...] = ("jax", "mjx", "mjx-warp")
     """Engines."""
-    physics_worlds: tuple[int, ...] = (2048, 8192)
-    """Worlds to measure engines with."""
-    worlds: tuple[int, ...] = (16, 256, 2048, 8192)
-    """Worlds to train with, 16 steps each per iteration."""
+    physics_envs: tuple[int, ...] = (2048, 8192)
+    """Numbers of envs to measure engines with [envs]."""
+    num_envs: tuple[int, ...] = (16, 256, 2048, 8192)
+    """Numbers of envs to train with, 16 steps each per iteration [envs]."""
     seeds: tuple[int, ...] = (1, 5)
-    """Seeds side by side."""
+    """Numbers of seeds in one program [runs]."""
 
 
 def against_the_cpu(task: str) -> dict[str, Any]:
-    """The largest difference of one step on the device from the same step on the CPU, over 256 worlds after 20 random steps."""
+    """Return the largest difference to the CPU of one step, in 256 envs after 20 random steps."""
     env = dg.make_env(task, physics="jax")
 
     def walk(key, steps):
         state = jax.vmap(env.reset)(jax.random.split(key, 256))
         actions = jax.random.uniform(key, (steps, 256, env.action_size), minval=-1, maxval=1)
-        return jax.lax.scan(lambda s, a: (jax.vmap(env.step)(s, a), None), state, actions)[
-            0
-        ], actions[0]
+
+        def step(state, action):
+            return jax.vmap(env.step)(state, action), None
+
+        return jax.lax.scan(step, state, actions)[0], actions[0]
 
     with jax.default_device(jax.devices("cpu")[0]):
-        given = jax.device_get(jax.jit(walk, static_argnums=1)(jax.random.key(0), 20))
+        start = jax.device_get(jax.jit(walk, static_argnums=1)(jax.random.key(0), 20))
     after = []
     for device in (jax.devices()[0], jax.devices("cpu")[0]):
         with jax.default_device(device):
-            after.append(jax.device_get(jax.jit(jax.vmap(env.step))(*given)))
+            after.append(jax.device_get(jax.jit(jax.vmap(env.step))(*start)))
     return {"task": task, "observation": float(np.abs(after[0].obs - after[1].obs).max())}
 
 
-def engine(task: str, name: str, worlds: int, arguments: Arguments) -> dict[str, Any]:
-    """Environment steps per second, and seconds to compile."""
-    speed, compiling = physics.engine_speed(
-        task, name, worlds, physics.Arguments(seconds=arguments.seconds, device="gpu")
-    )
-    return {
-        "task": task,
-        "engine": name,
-        "worlds": worlds,
-        "steps_per_second": speed,
-        "compile_seconds": compiling,
-    }
+def engine(task: str, name: str, num_envs: int, arguments: Arguments) -> dict[str, Any]:
+    """Return environment steps per second, and seconds to compile."""
+    options = physics.Arguments(seconds=arguments.seconds, device="gpu")
+    speed, compiling = physics.engine_speed(task, name, num_envs, options)
+    about = {"task": task, "engine": name, "num_envs": num_envs}
+    return {**about, "steps_per_second": speed, "compile_seconds": compiling}
 
 
-def training(algo: str, worlds: int, seeds: int, arguments: Arguments) -> dict[str, Any]:
-    """Samples per second of all seeds together, seconds to compile, and the most memory so far."""
+def training(algo: str, num_envs: int, seeds: int, arguments: Arguments) -> dict[str, Any]:
+    """Return samples per second of all seeds, seconds to compile, and the peak of memory."""
     config = resolve(
         dg.Config(
             env=arguments.tasks[0],
             algo=algo,
-            num_envs=worlds,
+            num_envs=num_envs,
             num_steps=16,
             num_seeds=seeds,
             total_steps=10**7,
@@ -104,28 +100,33 @@ def training(algo: str, worlds: int, seeds: int, arguments: Arguments) -> dict[s
     peak = (jax.devices()[0].memory_stats() or {}).get("peak_bytes_in_use")
     finite = all(bool(jnp.isfinite(rows[f"{part}/loss"]).all()) for part in ("policy", "critic"))
     return {
-        "algo": algo, "worlds": worlds, "seeds": seeds, "steps_per_second": speed, "compile_seconds": compiled,
-        "peak_bytes": peak, "finite": finite,
-    }  # fmt: skip
+        "algo": algo,
+        "num_envs": num_envs,
+        "seeds": seeds,
+        "steps_per_second": speed,
+        "compile_seconds": compiled,
+        "peak_bytes": peak,
+        "finite": finite,
+    }
 
 
 def measurements(arguments: Arguments) -> Iterator[tuple[str, Any]]:
-    """All of them, to be made one after the other: what kind, and how."""
+    """Yield the kind of each measurement, and its function."""
     for task in arguments.tasks:
         yield "against_the_cpu", lambda task=task: against_the_cpu(task)
-    for worlds in arguments.worlds:
+    for num_envs in arguments.num_envs:
         for seeds in arguments.seeds:
             for algo in ("ppo", "dppo"):
-                yield "training", lambda a=algo, w=worlds, s=seeds: training(a, w, s, arguments)
-    for worlds in arguments.physics_worlds:
+                yield "training", lambda a=algo, n=num_envs, s=seeds: training(a, n, s, arguments)
+    for num_envs in arguments.physics_envs:
         for task in arguments.tasks:
             for name in arguments.engines:
-                yield "engines", lambda t=task, n=name, w=worlds: engine(t, n, w, arguments)
+                yield "engines", lambda t=task, e=name, n=num_envs: engine(t, e, n, arguments)
 
 
 def main() -> None:
-    """One line per measurement, and the file."""
-    arguments = parse.arguments(Arguments, description="What an accelerator makes of it.")
+    """Print a line per measurement, and write the file."""
+    arguments = tyro.cli(Arguments, description="Measurements on an accelerator.")
     jax.config.update("jax_enable_compilation_cache", False)
     device, began = jax.devices()[0], time.monotonic()
     found: dict[str, Any] = {
@@ -140,9 +141,7 @@ def main() -> None:
             continue
         try:
             row = measure()
-        except (
-            Exception
-        ) as reason:  # one engine that is not installed, or has no room, leaves the others
+        except Exception as reason:  # one engine may be missing or have no memory
             row = {"failed": f"{type(reason).__name__}: {str(reason)[:200]}"}
         found.setdefault(kind, []).append(row)
         print(kind, json.dumps(row), flush=True)

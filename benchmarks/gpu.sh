@@ -1,5 +1,5 @@
 #!/usr/bin/env bash
-# Everything that needs a GPU, in one command of at most eight minutes after the installation: benchmarks/gpu.sh [flags of gpu.py]
+# All measurements that need a GPU, in at most eight minutes: benchmarks/gpu.sh [flags of gpu.py]
 set -euo pipefail
 cd "$(dirname "$0")/.."
 pip install -q -c constraints.txt -e ".[cuda13,warp]"

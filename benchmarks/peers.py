@@ -1,4 +1,4 @@
-"""Training steps per second of stable-baselines3 and sb3-contrib, in every layout that may be their fastest."""
+"""Training steps per second of stable-baselines3 and sb3-contrib, in several layouts."""
 
 import itertools
 import time
@@ -9,7 +9,7 @@ from typing import Any
 import gymnasium
 
 from dgae_jax.envs.registry import TASKS
-from dgae_jax.physics.registry import cores
+from dgae_jax.physics.cores import cores
 
 
 @dataclass(frozen=True)
@@ -24,19 +24,20 @@ class Peer:
 
 
 LAYOUTS = ((1, False), (8, False), (16, False), (8, True), (16, True))
-"""Worlds, and whether each has a process of its own."""
+"""Number of envs, and True for a process each."""
 
 
 def all_of(task: str, width: int, seconds: float, samples: dict[str, int]) -> Iterator[Peer]:
-    """Every algorithm, with its samples per iteration, in every layout, on one thread of torch and on as many as there are cores."""
-    for algo, (worlds, processes), threads in itertools.product(
+    """Measure every algorithm in every layout, on one thread of torch and on one per core."""
+    for algo, (envs, processes), threads in itertools.product(
         samples, LAYOUTS, sorted({1, cores()})
     ):
         speed = steps_per_second(
-            task, algo, width, worlds, processes, threads, samples[algo], seconds
+            task, algo, width, envs, processes, threads, samples[algo], seconds
         )
         where = "processes" if processes else "one process"
-        name = f"stable-baselines3 {algo}, {task}, 2 × {width}, {worlds} envs in {where}, {threads} threads"
+        layout = f"{envs} envs in {where}, {threads} threads"
+        name = f"stable-baselines3 {algo}, {task}, 2 × {width}, {layout}"
         yield Peer(task, algo, width, name, speed)
 
 
@@ -44,13 +45,13 @@ def steps_per_second(
     task: str,
     algo: str,
     width: int,
-    worlds: int,
+    envs: int,
     processes: bool,
     threads: int,
     samples: int,
     seconds: float,
 ) -> float:
-    """As many iterations as fit, the first left out."""
+    """Time as many iterations as fit, without the first."""
     import torch  # pyright: ignore[reportMissingImports]
     from stable_baselines3.common.callbacks import BaseCallback  # pyright: ignore[reportMissingImports]
     from stable_baselines3.common.env_util import make_vec_env  # pyright: ignore[reportMissingImports]
@@ -67,22 +68,19 @@ def steps_per_second(
 
     torch.set_num_threads(threads)
 
-    def world() -> gymnasium.Env:
-        gymnasium.logger.min_level = (
-            gymnasium.logger.ERROR
-        )  # that v4 is not the latest version is known
-        return gymnasium.make(TASKS[task].eval_envs["v4"])
+    def make() -> gymnasium.Env:
+        gymnasium.logger.min_level = gymnasium.logger.ERROR  # v4 is not the latest version
+        return gymnasium.make(TASKS[task].referees["v4"])
 
-    env = VecNormalize(
-        make_vec_env(world, worlds, vec_env_cls=SubprocVecEnv if processes else DummyVecEnv)
-    )
-    _model(algo, env, width, samples // worlds).learn(10**9, callback=Clock())
+    vec_env_cls = SubprocVecEnv if processes else DummyVecEnv
+    env = VecNormalize(make_vec_env(make, envs, vec_env_cls=vec_env_cls))
+    _model(algo, env, width, samples // envs).learn(10**9, callback=Clock())
     env.close()
-    return samples // worlds * worlds * (len(ends) - 2) / (ends[-1] - ends[1])
+    return samples // envs * envs * (len(ends) - 2) / (ends[-1] - ends[1])
 
 
 def _model(algo: str, env: Any, width: int, steps: int) -> Any:
-    """The library's own algorithm with our samples per iteration, and PPO and TRPO with our minibatches and epochs."""
+    """The library's algorithm with our samples per iteration, minibatches and epochs."""
     from sb3_contrib import TRPO  # pyright: ignore[reportMissingImports]
     from stable_baselines3 import A2C, PPO  # pyright: ignore[reportMissingImports]
 

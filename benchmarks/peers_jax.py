@@ -1,4 +1,4 @@
-"""Training steps per second of PPO in Brax and in rejax, on our own task and engine."""
+"""Training steps per second of PPO in Brax and in rejax, on our tasks and engine."""
 
 import contextlib
 import dataclasses
@@ -18,12 +18,12 @@ SAMPLES, EPOCHS, MINIBATCHES = 2048, 10, 32
 
 
 def all_of(task: str, width: int, seconds: float) -> Iterator[Peer]:
-    """Each library in its layouts; one that cannot run here is left out with its reason."""
+    """Measure each library in its layouts; print why one cannot run here."""
     for library, (measure, layouts) in LIBRARIES.items():
-        for worlds in layouts:
-            name = f"{library} PPO, {task}, 2 × {width}, {worlds} envs, `jax` physics"
+        for envs in layouts:
+            name = f"{library} PPO, {task}, 2 × {width}, {envs} envs, `jax` physics"
             try:
-                yield Peer(task, "PPO", width, name, measure(task, width, worlds, seconds))
+                yield Peer(task, "PPO", width, name, measure(task, width, envs, seconds))
             except Exception as reason:
                 print(
                     f"{name}: {type(reason).__name__}: {str(reason).partition(chr(10))[0][:120]}",
@@ -38,7 +38,7 @@ class _Clock:
         self.seconds, self.ends = seconds, []
 
     def tick(self) -> bool:
-        """Whether there is time for another."""
+        """Return True if there is time for another."""
         self.ends.append(time.perf_counter())
         return len(self.ends) < 4 or self.ends[-1] - self.ends[1] < self.seconds
 
@@ -47,7 +47,7 @@ class _Clock:
         return SAMPLES * (len(self.ends) - 2) / (self.ends[-1] - self.ends[1])
 
 
-def brax(task: str, width: int, worlds: int, seconds: float) -> float:
+def brax(task: str, width: int, envs: int, seconds: float) -> float:
     """One training step of Brax per call, without evaluations."""
     from brax.training.agents.ppo import networks, train
 
@@ -68,18 +68,28 @@ def brax(task: str, width: int, worlds: int, seconds: float) -> float:
         value_hidden_layer_sizes=(width, width),
         activation=jnp.tanh,
     )
-    iterations = 10_000
+    iterations = 10_000  # its minibatches are whole unrolls
     with contextlib.suppress(_Over), trainers():
         train.train(
-            dg.make_env(task), num_timesteps=iterations * SAMPLES, num_envs=worlds, episode_length=1000,
-            unroll_length=SAMPLES // MINIBATCHES, batch_size=1, num_minibatches=MINIBATCHES,  # its minibatches are whole unrolls
-            num_updates_per_batch=EPOCHS, normalize_observations=True, network_factory=make, num_evals=iterations + 1, run_evals=False,
-            progress_fn=progress, max_devices_per_host=1,
-        )  # fmt: skip
+            dg.make_env(task),
+            num_timesteps=iterations * SAMPLES,
+            num_envs=envs,
+            episode_length=1000,
+            unroll_length=SAMPLES // MINIBATCHES,
+            batch_size=1,
+            num_minibatches=MINIBATCHES,
+            num_updates_per_batch=EPOCHS,
+            normalize_observations=True,
+            network_factory=make,
+            num_evals=iterations + 1,
+            run_evals=False,
+            progress_fn=progress,
+            max_devices_per_host=1,
+        )
     return clock.rate()
 
 
-def rejax(task: str, width: int, worlds: int, seconds: float) -> float:
+def rejax(task: str, width: int, envs: int, seconds: float) -> float:
     """One training iteration of rejax per call."""
     from rejax import PPO  # pyright: ignore[reportMissingImports]
     from rejax.compat.brax2gymnax import Brax2GymnaxEnv  # pyright: ignore[reportMissingImports]
@@ -87,10 +97,16 @@ def rejax(task: str, width: int, worlds: int, seconds: float) -> float:
     env: Any = dg.make_env(task)
     env.episode_length = 1000
     algo = PPO.create(
-        env=Brax2GymnaxEnv(env), agent_kwargs={"hidden_layer_sizes": (width, width), "activation": "tanh"}, num_envs=worlds,
-        num_steps=SAMPLES // worlds, num_epochs=EPOCHS, num_minibatches=MINIBATCHES, normalize_observations=True, normalize_rewards=True,
+        env=Brax2GymnaxEnv(env),
+        agent_kwargs={"hidden_layer_sizes": (width, width), "activation": "tanh"},
+        num_envs=envs,
+        num_steps=SAMPLES // envs,
+        num_epochs=EPOCHS,
+        num_minibatches=MINIBATCHES,
+        normalize_observations=True,
+        normalize_rewards=True,
         total_timesteps=10**6,
-    )  # fmt: skip
+    )
     state, step, clock = (
         jax.jit(algo.init_state)(jax.random.key(0)),
         jax.jit(algo.train_iteration),
@@ -106,7 +122,7 @@ LIBRARIES: dict[str, tuple[Callable[..., float], tuple[int, ...]]] = {
     "Brax": (brax, (16, 32)),
     "rejax": (rejax, (16, 64)),
 }
-"""How each is measured, and with how many worlds; Brax's minibatches must be a multiple of them."""
+"""Functions and numbers of envs, of which Brax's minibatches must be a multiple."""
 
 if __name__ == "__main__":
     for found in all_of("hopper", 64, 5.0):

@@ -1,9 +1,9 @@
-"""Memory, file handles and threads of the real training command over a long run, read from Linux's /proc.
+"""Memory, open files and threads of `dgae train` over a long run, read from Linux's /proc.
 
     python benchmarks/soak.py --minutes 60 --run-dir runs/soak
 
-The default run (DPPO on Hopper, `native`, a checkpoint, an evaluation and a plot every 200,000 samples) goes on until a SIGTERM
-ends it. Exit code 1 if it fell over, or if in the last quarter memory was more than 5 % or a handle above the second quarter.
+The default run (DPPO on Hopper, `native`) trains until SIGTERM ends it. The exit code is 1 if it
+crashed, or if the last quarter used more than the second: 5 % of memory, or any file or thread.
 """
 
 import signal
@@ -14,7 +14,8 @@ import time
 from dataclasses import dataclass
 from pathlib import Path
 
-from dgae_jax.cli import parse
+import tyro
+
 from dgae_jax.run import files, metrics
 
 TRAIN = Path(__file__).parent.parent / "experiments" / "train.py"
@@ -22,7 +23,7 @@ TRAIN = Path(__file__).parent.parent / "experiments" / "train.py"
 
 @dataclass(frozen=True)
 class Arguments:
-    """How long, and where."""
+    """The run, and how often it is measured."""
 
     run_dir: Path
     """Directory of the run, new; soak.jsonl in it gets the measurements [path]."""
@@ -33,28 +34,16 @@ class Arguments:
 
 
 def measured(pid: int) -> dict[str, float]:
-    """What a process holds now: resident memory [MB], open files, threads."""
-    status = dict(
-        line.split(":", 1) for line in Path(f"/proc/{pid}/status").read_text().splitlines()
-    )
-    handles = len(list(Path(f"/proc/{pid}/fd").iterdir()))
-    return {
-        "rss": int(status["VmRSS"].split()[0]) / 1024,
-        "files": handles,
-        "threads": int(status["Threads"]),
-    }
+    """Return resident memory [MB], open files and threads of a process."""
+    lines = Path(f"/proc/{pid}/status").read_text().splitlines()
+    status = dict(line.split(":", 1) for line in lines)
+    memory, files = int(status["VmRSS"].split()[0]) / 1024, Path(f"/proc/{pid}/fd").iterdir()
+    return {"rss": memory, "files": len(list(files)), "threads": int(status["Threads"])}
 
 
 def main() -> int:
-    arguments = parse.arguments(Arguments, description="Watch the memory of a long run.")
-    argv = [
-        "--run-dir",
-        str(arguments.run_dir),
-        "--physics",
-        "native",
-        "--total-steps",
-        "1_000_000_000",
-    ]
+    arguments = tyro.cli(Arguments, description="Watch the memory of a long run.")
+    argv = f"--run-dir {arguments.run_dir} --physics native --total-steps 1_000_000_000".split()
     process = subprocess.Popen([sys.executable, str(TRAIN), *argv], stdout=subprocess.DEVNULL)
     began, rows = time.monotonic(), []
     while (seconds := time.monotonic() - began) < 60 * arguments.minutes and process.poll() is None:
@@ -67,25 +56,20 @@ def main() -> int:
     process.send_signal(signal.SIGTERM)
     code, stopping = process.wait(), time.monotonic() - since
     if len(rows) < 4:
-        print(
-            f"error: the run ended, with exit code {code}, before there were four measurements",
-            file=sys.stderr,
-        )
+        print(f"error: the run ended with exit code {code}", file=sys.stderr)
         return 1
     steps = metrics.read(arguments.run_dir / "metrics.jsonl")[-1]["steps"]
     print(
-        f"{steps:,} samples in {arguments.minutes:g} minutes, then SIGTERM: exit code {code} after {stopping:.1f} s"
+        f"{steps:,} samples in {arguments.minutes:g} minutes; exit code {code} {stopping:.1f} s after"
     )
     grown = False
     for name, unit, slack in (("rss", " MB", 1.05), ("files", "", 1.0), ("threads", "", 1.0)):
         column = [row[name] for row in rows]
         quarter = len(column) // 4
-        second, fourth = (
-            statistics.median(column[quarter : 2 * quarter]),
-            statistics.median(column[-quarter:]),
-        )
-        shown = f"start {column[0]:,.0f}, second quarter {second:,.0f}, last quarter {fourth:,.0f}, end {column[-1]:,.0f}"
-        print(f"{name}: {shown}{unit}")
+        second = statistics.median(column[quarter : 2 * quarter])
+        fourth = statistics.median(column[-quarter:])
+        quarters = f"second quarter {second:,.0f}, last quarter {fourth:,.0f}"
+        print(f"{name}: start {column[0]:,.0f}, {quarters}, end {column[-1]:,.0f}{unit}")
         grown |= fourth > slack * second
     return int(grown or code != 128 + signal.SIGTERM)
 

@@ -1,13 +1,15 @@
-"""Training steps per second, ours and others', side by side in one run, and what the cores could do at best.
+"""Training steps per second, ours and others', in one run, and over a roofline.
 
-    pip install -e ".[bench]" && python benchmarks/throughput.py --json benchmarks/results/throughput.json
+    pip install -e ".[bench]" && python benchmarks/throughput.py --json benchmarks/results/new.json
 
-Everyone trains on the same task with the same network (tanh), samples per iteration, epochs, minibatches and normalisation.
-stable-baselines3 and sb3-contrib run with 1, 8 and 16 worlds in one process, 8 and 16 in processes, on one and on all threads of
-torch; the fastest setting is the one to compare with. Brax's and rejax's PPO run on our own `jax` engine. The roofline is the time
-of an iteration in which all cores do nothing but simulate (C MuJoCo), multiply matrices (the operations that the program counts, at
-the highest rate measured here) and evaluate the residuals of the quantile-Huber loss (at the rate measured here). Nothing else
-should run on the machine meanwhile.
+Everyone trains on the same task with the same network (tanh), samples per iteration, epochs,
+minibatches and normalization. stable-baselines3 and sb3-contrib run with 1, 8 and 16 envs in one
+process, 8 and 16 in processes, on one thread of torch and on all; the fastest counts. PPO of Brax
+and of rejax runs on our own `jax` engine.
+
+The roofline is the time of an iteration in which all cores do nothing but simulate (C MuJoCo),
+multiply matrices (the operations that the program counts, at the highest rate measured here) and
+compute the quantile-Huber loss (at the rate measured here). Nothing else should run meanwhile.
 """
 
 import dataclasses
@@ -26,20 +28,19 @@ import jax.numpy as jnp
 import numpy as np
 import peers
 import peers_jax
+import tyro
 from mujoco.batch import Batch
 from table import PEER_OF, rival_of
 from turns import counted
 
 import dgae_jax as dg
-from dgae_jax.cli import parse
-from dgae_jax.configs.config import Config
-from dgae_jax.configs.resolved import resolve
+from dgae_jax.configs.resolved import ResolvedConfig, resolve
 from dgae_jax.learn import devices
 from dgae_jax.learn.build import make_policy, make_task, make_trainer, seed_keys
-from dgae_jax.learn.iteration import _estimate, _roll_out, acting, nothing
+from dgae_jax.learn.iteration import _estimate, _roll_out, sampler
 from dgae_jax.learn.parallel import COMPILER_OPTIONS
 from dgae_jax.learn.types import InferenceState
-from dgae_jax.physics.registry import cores
+from dgae_jax.physics.cores import cores
 from dgae_jax.run import runtime
 from dgae_jax.run.options import RunOptions
 
@@ -72,7 +73,7 @@ class Row:
     algo: str
     physics: str
     width: int
-    worlds: int
+    num_envs: int
     devices: int
     compile_seconds: float
     steps_per_second: float
@@ -83,7 +84,7 @@ class Row:
 
 
 def fastest(f: Callable[[], Any], seconds: float) -> float:
-    """The shortest of the calls that fit into some time, after one that compiles [s]."""
+    """Return the seconds of the fastest call, of those that fit after one that compiles."""
     jax.block_until_ready(f())
     ends = [time.perf_counter()]
     while ends[-1] - ends[0] < seconds:
@@ -92,33 +93,31 @@ def fastest(f: Callable[[], Any], seconds: float) -> float:
     return min(b - a for a, b in itertools.pairwise(ends))
 
 
-def setting(task: str, algo: str, physics: str, width: int) -> Config:
-    """An algorithm as on Walker2d, on any task, with networks as wide as asked for; A2C takes one step per rollout of 8, as its peer."""
-    config = dataclasses.replace(dg.preset("tuned", algo, "walker2d"), env=task)
-    as_peer = PEER_OF[algo] == "A2C"
-    steps = {"optimizer": "rmsprop", "epochs": 1, "minibatches": 1} if as_peer else {}
-    policy, critic = (
-        dataclasses.replace(part, hidden=(width, width), **steps)
-        for part in (config.policy, config.critic)
-    )
-    num_steps = 8 if as_peer else config.num_steps
-    return resolve(
-        dataclasses.replace(
-            config, physics=physics, num_steps=num_steps, policy=policy, critic=critic
-        )
-    )
+def setting(task: str, algo: str, physics: str, width: int) -> ResolvedConfig:
+    """Return Walker2d's preset on any task, with other widths.
+
+    A2C takes one gradient step per rollout of 8, as its peer does.
+    """
+    config = dg.preset("tuned", algo, "walker2d")
+    config = config.replace(env=task, physics=physics)
+    config = config.replace(**{f"{part}.hidden": (width, width) for part in ("policy", "critic")})
+    if PEER_OF[algo] == "A2C":
+        steps = {"optimizer": "rmsprop", "epochs": 1, "minibatches": 1}
+        both = {f"{part}.{name}": x for part in ("policy", "critic") for name, x in steps.items()}
+        config = config.replace(num_steps=8, **both)
+    return resolve(config)
 
 
 class Iteration(NamedTuple):
-    """What one iteration takes, and what came before the first."""
+    """Times of an iteration, and of compiling it."""
 
     compile_seconds: float
     seconds: float
     devices: int
 
 
-def iteration(config: Config, seconds: float) -> Iteration:
-    """From nothing to the first iteration, then as many iterations as fit, one per call."""
+def iteration(config: ResolvedConfig, seconds: float) -> Iteration:
+    """Time compilation, then as many iterations as fit, one per call."""
     jax.config.update("jax_enable_compilation_cache", False)
     count = runtime.use_devices(config, RunOptions())
     began = time.perf_counter()
@@ -134,19 +133,27 @@ def iteration(config: Config, seconds: float) -> Iteration:
     return Iteration(compiled - one, one, count)
 
 
-def ours(config: Config, seconds: float) -> Row:
-    """One of our algorithms."""
+def ours(config: ResolvedConfig, seconds: float) -> Row:
+    """Measure one of our algorithms."""
     compiled, one, count = iteration(config, seconds)
     samples, alone = config.samples_per_iteration, parts_of(config, count, seconds / 10)
     best = samples / roofline(config)
     return Row(
-        config.env, str(config.algo), str(config.physics), config.policy.hidden[0], config.num_envs, count, compiled, samples / one, best,
-        alone,
-    )  # fmt: skip
+        task=config.env,
+        algo=config.algo,
+        physics=config.physics,
+        width=config.policy.hidden[0],
+        num_envs=config.num_envs,
+        devices=count,
+        compile_seconds=compiled,
+        steps_per_second=samples / one,
+        roofline=best,
+        parts=alone,
+    )
 
 
 class Pieces(NamedTuple):
-    """An iteration taken apart, and what each part is given."""
+    """Parts of an iteration, each with its arguments."""
 
     rollout: tuple[Callable, tuple]
     estimate: tuple[Callable, tuple]
@@ -154,10 +161,10 @@ class Pieces(NamedTuple):
     critic: tuple[Callable, tuple]
 
 
-def taken_apart(config: Config, count: int) -> Pieces:
-    """The parts of the first iteration, the rollout on so many devices."""
+def taken_apart(config: ResolvedConfig, count: int) -> Pieces:
+    """Return the parts of the first iteration, the rollout on so many devices."""
     env, mesh = make_task(config), devices.make_mesh(count)
-    algorithm = dg.make_algorithm(str(config.algo), env, config)
+    algorithm = dg.make_algorithm(config.algo, env, config)
     init, _ = dg.make_train(algorithm, env, config)
     key = jax.random.key(0)
     state = jax.jit(init)(key)
@@ -168,9 +175,7 @@ def taken_apart(config: Config, count: int) -> Pieces:
         return _roll_out(env, algorithm, state, keys, config.episode_length)
 
     def estimate(state, step):
-        return _estimate(
-            algorithm, state, step, step.reward, key, config.gamma, config.gae_lambda, nothing
-        )[0]
+        return _estimate(algorithm, state, step, step.reward, key, config)[0]
 
     step = jax.device_get(jax.jit(roll)(state, keys)[1])
     batch = jax.jit(estimate)(state, step)
@@ -182,8 +187,8 @@ def taken_apart(config: Config, count: int) -> Pieces:
     )
 
 
-def parts_of(config: Config, count: int, seconds: float) -> dict[str, float]:
-    """Milliseconds of each part when it runs alone; policy and critic on one device each."""
+def parts_of(config: ResolvedConfig, count: int, seconds: float) -> dict[str, float]:
+    """Return the milliseconds of each part alone; policy and critic on one device each."""
     found = {}
     for name, (f, args) in taken_apart(config, count)._asdict().items():
         part = jax.jit(f, compiler_options=COMPILER_OPTIONS)
@@ -191,48 +196,46 @@ def parts_of(config: Config, count: int, seconds: float) -> dict[str, float]:
     return found
 
 
-def roofline(config: Config) -> float:
-    """Seconds of an iteration on all cores if there were nothing but physics, matrix products and residuals."""
+def roofline(config: ResolvedConfig) -> float:
+    """Return the seconds of an iteration of nothing but physics, matrix products and losses."""
     flops = sum(float(counted(f, "cpu")(*args)[1].flops) for f, args in _without_physics(config))
-    products = flops / product_rate()
-    quantiles, fit = config.critic.quantiles, config.critic
-    targets = 1 if fit.target == "lambda-return" else quantiles
-    residuals = (
-        (fit.epochs or 0) * config.samples_per_iteration * quantiles * targets
-        if quantiles and targets
-        else 0
-    )
-    return (
-        c_seconds(config.env, config.num_envs, config.num_steps)
-        + products
-        + residuals / (cores() * residual_rate(quantiles or 1))
-    )
+    seconds = c_seconds(config.env, config.num_envs, config.num_steps) + flops / product_rate()
+    critic = config.critic
+    if critic.is_distribution:
+        targets = 1 if critic.target == "lambda-return" else critic.outputs
+        errors = critic.fit["epochs"] * config.samples_per_iteration * critic.outputs * targets
+        seconds += errors / (cores() * error_rate(critic.outputs))
+    return seconds
 
 
-def _without_physics(config: Config) -> list[tuple[Callable, tuple]]:
-    """Acting on all samples, estimating, fitting."""
+def _without_physics(config: ResolvedConfig) -> list[tuple[Callable, tuple]]:
+    """Return functions that act on all samples, estimate, and fit."""
     pieces = taken_apart(dataclasses.replace(config, physics="native"), 1)
     state, _ = pieces.rollout[1]
-    actor, env = InferenceState(state.policy.params, state.observations), make_task(config)
-    act = acting(make_policy(env, config), actor)
+    actor, env = InferenceState(state.policy.params, state.obs_stats), make_task(config)
+    act = sampler(make_policy(env, config), actor)
     keys, obs = jax.random.split(jax.random.key(0), config.num_envs), state.episodes.env.obs
-    draw = lambda: jax.lax.scan(
-        lambda c, _: (c, act(keys, obs)[0]), 0, None, length=config.num_steps
-    )[1]  # noqa: E731
-    return [(draw, ()), *pieces[1:]]
+
+    def act_on_all():
+        def step(carry, _):
+            return carry, act(keys, obs)[0]
+
+        return jax.lax.scan(step, 0, None, length=config.num_steps)[1]
+
+    return [(act_on_all, ()), *pieces[1:]]
 
 
 @functools.cache
-def c_seconds(task: str, worlds: int, num_steps: int) -> float:
-    """C MuJoCo alone, on all cores, under random controls [s]."""
+def c_seconds(task: str, envs: int, num_steps: int) -> float:
+    """Return the seconds of C MuJoCo alone, on all cores, under random controls."""
     env: Any = dg.make_env(task, physics="native")
-    model, rng = env.physics.model, np.random.default_rng(0)
-    batch = Batch(model, worlds, min(cores(), worlds))
+    model, rng = env._physics.model, np.random.default_rng(0)
+    batch = Batch(model, envs, min(cores(), envs))
     batch.bind("qpos")[:] = model.qpos0
 
     def run() -> None:
         for _ in range(num_steps):
-            batch.bind("ctrl")[:] = rng.uniform(-1, 1, (worlds, model.nu))
+            batch.bind("ctrl")[:] = rng.uniform(-1, 1, (envs, model.nu))
             batch.step(nstep=env.FRAME_SKIP)
 
     return fastest(run, 2.0)
@@ -240,15 +243,15 @@ def c_seconds(task: str, worlds: int, num_steps: int) -> float:
 
 @functools.cache
 def product_rate(size: int = 512) -> float:
-    """Floating-point operations per second of matrix products, which XLA divides between all cores."""
+    """Return flops per second of matrix products, which XLA divides between all cores."""
     x = jnp.ones((size, size))
     many = jax.jit(lambda x: jax.lax.fori_loop(0, 20, lambda i, y: jnp.tanh(y[:1]) + x @ y, x))
     return 20 * 2 * size**3 / fastest(lambda: many(x), 2.0)
 
 
 @functools.cache
-def residual_rate(quantiles: int) -> float:
-    """Residuals per second of the quantile-Huber loss with its derivatives on one core."""
+def error_rate(quantiles: int) -> float:
+    """Return errors per second of the quantile-Huber loss with its gradients on one core."""
     x = jax.random.normal(jax.random.key(0), (64, quantiles))
     slopes = jax.grad(lambda z, t: dg.quantile_huber_loss(z, t).sum())
     many = jax.jit(
@@ -258,57 +261,52 @@ def residual_rate(quantiles: int) -> float:
     return 100 * 64 * quantiles**2 / fastest(lambda: many(x), 1.0)
 
 
-def settings(arguments: Arguments) -> Iterator[Config]:
-    """All of ours, one after the other."""
+def settings(arguments: Arguments) -> Iterator[ResolvedConfig]:
+    """Yield all of ours."""
     for task, width, physics, algo in itertools.product(
         arguments.tasks, arguments.widths, arguments.physics, arguments.algos
     ):
         yield setting(task, algo, physics, width)
 
 
+def measured_peers(arguments: Arguments) -> Iterator[peers.Peer]:
+    """Yield the peers in all layouts."""
+    for task, width in itertools.product(arguments.tasks, arguments.widths):
+        samples = {
+            PEER_OF[algo]: setting(task, algo, "native", width).samples_per_iteration
+            for algo in arguments.algos
+        }
+        yield from peers.all_of(task, width, arguments.seconds, samples)
+        yield from peers_jax.all_of(task, width, arguments.seconds)
+
+
 def main() -> None:
     """Print the peers, then a row of ours each, over the fastest peer and over the roofline."""
-    arguments = parse.arguments(Arguments, description="Training throughput.")
-    others = []
-    if arguments.peers:
-        for task, width in itertools.product(arguments.tasks, arguments.widths):
-            samples = {
-                PEER_OF[algo]: setting(task, algo, "native", width).samples_per_iteration
-                for algo in arguments.algos
-            }
-            theirs = peers.all_of(task, width, arguments.seconds, samples)
-            for measured in itertools.chain(
-                theirs, peers_jax.all_of(task, width, arguments.seconds)
-            ):
-                others.append(measured)
-                print(f"{measured.name:76s} {measured.steps_per_second:9,.0f}", flush=True)
-    print(
-        f"{cores()} cores, {jax.devices()[0].device_kind}, jax {jax.__version__}; milliseconds of each part alone"
-    )
-    head = f"{'task':7s} {'algo':5s} {'physics':7s} {'width':>5s} {'compile s':>9s} {'steps/s':>9s} {'/ peer':>7s} {'/ roofline':>10s}"
-    print(head, *(f"{name:>9s}" for name in Pieces._fields))
+    arguments = tyro.cli(Arguments, description="Training throughput.")
+    others: list[dict[str, Any]] = []
+    for peer in measured_peers(arguments) if arguments.peers else ():
+        others.append(dataclasses.asdict(peer))
+        print(f"{peer.name:76s} {peer.steps_per_second:9,.0f}", flush=True)
+    print(f"{cores()} cores, {jax.devices()[0].device_kind}, jax {jax.__version__}; parts in ms")
+    print(f"{'task':7s} {'algo':5s} {'physics':7s} {'width':>5s} {'compile s':>9s}", end=" ")
+    print(f"{'steps/s':>9s} {'/ peer':>7s} {'/ roofline':>10s}", end=" ")
+    print(*(f"{name:>9s}" for name in Pieces._fields))
     rows = []
     for config in settings(arguments):
-        with multiprocessing.get_context("spawn").Pool(
-            1
-        ) as process:  # JAX starts with as many devices as the run has
+        # JAX starts with as many devices as the run has
+        with multiprocessing.get_context("spawn").Pool(1) as process:
             row = process.apply(ours, (config, arguments.seconds))
-        rows.append(row)
-        rival = rival_of(dataclasses.asdict(row), [dataclasses.asdict(o) for o in others])
-        over = f"{row.steps_per_second / rival['steps_per_second']:7.1f}" if rival else f"{'':7s}"
+        rows.append(dataclasses.asdict(row))
+        rival, speed = rival_of(rows[-1], others), row.steps_per_second
+        over = f"{speed / rival['steps_per_second']:7.1f}" if rival else f"{'':7s}"
+        print(f"{row.task:7s} {row.algo:5s} {row.physics:7s} {row.width:5d}", end=" ")
         print(
-            f"{row.task:7s} {row.algo:5s} {row.physics:7s} {row.width:5d} {row.compile_seconds:9.1f} {row.steps_per_second:9,.0f} {over}"
-            f" {row.steps_per_second / row.roofline:10.2f}",
-            *(f"{ms:9.1f}" for ms in row.parts.values()),
-            flush=True,
+            f"{row.compile_seconds:9.1f} {speed:9,.0f} {over} {speed / row.roofline:10.2f}", end=" "
         )
+        print(*(f"{ms:9.1f}" for ms in row.parts.values()), flush=True)
     if arguments.json:
-        facts = {**runtime.hardware(), "jax": jax.__version__}
-        found = {
-            "machine": facts,
-            "ours": [dataclasses.asdict(r) for r in rows],
-            "peers": [dataclasses.asdict(o) for o in others],
-        }
+        machine = {**runtime.hardware(), "jax": jax.__version__}
+        found = {"machine": machine, "ours": rows, "peers": others}
         arguments.json.parent.mkdir(parents=True, exist_ok=True)
         arguments.json.write_text(json.dumps(found, indent=1) + "\n")
 

@@ -1,10 +1,11 @@
-"""How many turns of loops follow one another in an environment step and in an update.
+"""Sequential loop iterations of an environment step and of an update.
 
     python benchmarks/turns.py
 
-On an accelerator a turn costs the launch of its kernels, and one whose loop goes on for as long as its data say so
-(a `while`) a round trip to the host besides. The programs are those for accelerators, run on this machine: turns are counted
-by carrying a counter through every loop of the traced program. Worlds begin at random poses and act at random.
+On an accelerator each iteration costs the launch of its kernels, and one of a data-dependent
+`while` loop a round trip to the host besides. The programs are those for accelerators, run here:
+iterations are counted by carrying a counter through every loop of the traced program. Envs begin in
+random poses and act at random.
 """
 
 import math
@@ -16,15 +17,22 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+import tyro
 
 import dgae_jax as dg
-from dgae_jax.cli import parse
 from dgae_jax.configs.resolved import resolve
 from dgae_jax.envs.registry import TASKS
 from dgae_jax.learn.types import Batch, TrainableState
 
-CALLS = {"jit": "jaxpr", "pjit": "jaxpr", "checkpoint": "jaxpr", "custom_vmap_call": "call", "closed_call": "call_jaxpr",
-         "custom_jvp_call": "call_jaxpr", "custom_vjp_call": "call_jaxpr"}  # fmt: skip
+CALLS = {
+    "jit": "jaxpr",
+    "pjit": "jaxpr",
+    "checkpoint": "jaxpr",
+    "custom_vmap_call": "call",
+    "closed_call": "call_jaxpr",
+    "custom_jvp_call": "call_jaxpr",
+    "custom_vjp_call": "call_jaxpr",
+}
 """Primitives that only call a program, and the parameter that holds it."""
 
 
@@ -32,19 +40,19 @@ CALLS = {"jit": "jaxpr", "pjit": "jaxpr", "checkpoint": "jaxpr", "custom_vmap_ca
 class Arguments:
     """What to count."""
 
-    worlds: int = 2048
-    """Worlds stepped side by side."""
+    num_envs: int = 2048
+    """Parallel envs [envs]."""
     steps: int = 10
     """Environment steps, of which the mean is printed [steps]."""
 
 
 class Counts(NamedTuple):
-    """What a program does in sequence, and how much it multiplies."""
+    """Sequential loop iterations of a program, and its flops."""
 
     known: Any
-    """Turns of loops of known length."""
+    """Iterations of loops of known length."""
     asked: Any
-    """Turns of other loops."""
+    """Iterations of `while` loops."""
     flops: Any
     """Floating-point operations of matrix products, 2 per multiplication."""
 
@@ -64,7 +72,7 @@ def counted(f: Callable, platform: str | None = None) -> Callable:
 
 
 def _run(program: Any, args: list, platform: str | None) -> tuple[list, Counts]:
-    """The program's outputs and what it does."""
+    """Return the program's outputs and counts."""
     jaxpr, consts = (program.jaxpr, program.consts) if hasattr(program, "consts") else (program, [])
     values, counts = (
         dict(zip([*jaxpr.constvars, *jaxpr.invars], [*consts, *args], strict=True)),
@@ -80,7 +88,7 @@ def _run(program: Any, args: list, platform: str | None) -> tuple[list, Counts]:
 
 
 def _evaluate(eqn: Any, args: list, platform: str | None) -> tuple[list, Counts]:
-    """One operation's outputs, and what it does."""
+    """Return one operation's outputs and counts."""
     name, how = eqn.primitive.name, eqn.params
     if name == "platform_index":
         chosen = [i for i, names in enumerate(how["platforms"]) if names and platform in names]
@@ -142,7 +150,7 @@ def _flops(eqn: Any) -> int:
 
 
 def _split(items: list, *sizes: int) -> tuple[list, ...]:
-    """The first so many, the next so many, the rest."""
+    """Split into the first, the next and the rest."""
     a, b = sizes
     return items[:a], items[a : a + b], items[a + b :]
 
@@ -151,21 +159,21 @@ def _add(a: Counts, b: Counts) -> Counts:
     return jax.tree.map(jnp.add, a, b)
 
 
-def of_step(name: str, worlds: int, steps: int) -> list[float]:
-    """Mean turns of one environment step of all worlds."""
+def of_step(name: str, num_envs: int, steps: int) -> list[float]:
+    """Return the mean iterations of one environment step of all envs."""
     env: Any = dg.make_env(name, physics="jax")
     low, high = env.action_range
     step, key, total = counted(jax.vmap(env.step)), jax.random.key(0), NONE
-    state = jax.jit(jax.vmap(env.reset))(jax.random.split(key, worlds))
+    state = jax.jit(jax.vmap(env.reset))(jax.random.split(key, num_envs))
     for k in jax.random.split(key, steps):
-        action = jax.random.uniform(k, (worlds, env.action_size), minval=low, maxval=high)
+        action = jax.random.uniform(k, (num_envs, env.action_size), minval=low, maxval=high)
         state, counts = step(state, action)
         total = _add(total, counts)
     return [float(total.known) / steps, float(total.asked) / steps]
 
 
 def of_update(algo: str) -> list[list[int]]:
-    """Turns of the policy's update and of the critic's fit, with the tuned preset of Hopper."""
+    """Return the iterations of both updates, with the tuned preset of Hopper."""
     config = resolve(dg.preset("tuned", algo, "hopper"))
     env = dg.make_env("hopper", physics="jax")
     algorithm = dg.make_algorithm(algo, env, config)
@@ -192,16 +200,14 @@ def of_update(algo: str) -> list[list[int]]:
 
 def main() -> None:
     """Print both tables, in Markdown."""
-    arguments = parse.arguments(Arguments, description="Turns of loops in a step and in an update.")
-    print(
-        f"| one environment step of {arguments.worlds:,} worlds, `jax` | known length | `while` | together |\n|---|---|---|---|"
-    )
+    arguments = tyro.cli(Arguments, description="Loop iterations of a step and of an update.")
+    step = f"one environment step of {arguments.num_envs:,} envs, `jax`"
+    print(f"| {step} | known length | `while` | together |\n|---|---|---|---|")
     for name in TASKS:
-        known, other = of_step(name, arguments.worlds, arguments.steps)
+        known, other = of_step(name, arguments.num_envs, arguments.steps)
         print(f"| {name} | {known:,.0f} | {other:,.0f} | {known + other:,.0f} |", flush=True)
-    print(
-        "\n| one update, Hopper's preset | policy: known length | `while` | critic: known length | `while` |\n|---|---|---|---|---|"
-    )
+    columns = "policy: known length | `while` | critic: known length | `while`"
+    print(f"\n| one update, Hopper's preset | {columns} |\n|---|---|---|---|---|")
     for algo in ("ppo", "dppo", "trpo", "dtrpo", "a2c", "da2c"):
         policy, critic = of_update(algo)
         print(

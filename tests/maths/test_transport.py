@@ -13,9 +13,6 @@ CVAR_HALF = jnp.array([2.0, 2.0, 0.0, 0.0])  # mean of the worse half
 
 def test_midpoints_of_four_quantiles_are_the_odd_eighths():
     assert_allclose(dg.quantile_midpoints(4), [1 / 8, 3 / 8, 5 / 8, 7 / 8])
-
-
-def test_fewer_than_one_quantile_is_refused():
     with pytest.raises(ValueError, match="at least 1"):
         dg.quantile_midpoints(0)
 
@@ -34,7 +31,7 @@ def test_spectral_metric_weighs_sorted_quantiles_by_hand():
 
 
 @pytest.mark.parametrize("weights", [None, CVAR_HALF, jnp.array([0.4, 0.8, 1.2, 1.6])])
-def test_metric_is_antisymmetric_translation_and_scale_equivariant(weights, key):
+def test_metric_is_antisymmetric_and_equivariant(weights, key):
     u, v = jax.random.normal(key, (2, 7, 3, 4))
     d = dg.directional_metric(u, v, weights)
     assert d.shape == (7, 3)
@@ -43,14 +40,14 @@ def test_metric_is_antisymmetric_translation_and_scale_equivariant(weights, key)
     assert_allclose(dg.directional_metric(3 * u, 3 * v, weights), 3 * d, atol=1e-5)
 
 
-def test_metric_is_wasserstein_with_a_sign_where_one_distribution_dominates(key):
+def test_metric_is_signed_wasserstein_under_dominance(key):
     u = jax.random.normal(key, (5, 16))
     v = u + jnp.arange(1.0, 17.0)
     assert_allclose(dg.directional_metric(v, u), dg.wasserstein(v, u), rtol=1e-5)
     assert_allclose(dg.directional_metric(u, v), -dg.wasserstein(v, u), rtol=1e-5)
 
 
-def test_similar_means_and_different_shapes_are_near_in_the_metric_and_far_in_wasserstein():
+def test_equal_means_are_near_in_the_metric_and_far_in_wasserstein():
     narrow, wide = jnp.array([-1.0, 1.0]), jnp.array([-10.0, 10.0])
     assert_allclose(dg.directional_metric(wide, narrow), 0.0)
     assert_allclose(dg.wasserstein(wide, narrow), 9.0)
@@ -66,7 +63,7 @@ def test_similar_means_and_different_shapes_are_near_in_the_metric_and_far_in_wa
         jnp.array([0.0, 1.0]),
     ],
 )
-def test_weights_that_are_negative_or_do_not_integrate_to_one_are_refused(weights):
+def test_weights_that_are_negative_or_not_of_mean_one_are_refused(weights):
     with pytest.raises(ValueError, match="of mean 1"):
         dg.directional_metric(jnp.zeros(2), jnp.zeros(2), weights)
 
@@ -74,15 +71,6 @@ def test_weights_that_are_negative_or_do_not_integrate_to_one_are_refused(weight
 def test_weights_may_be_traced():
     u, v = jnp.array([4.0, 1.0, 3.0, 2.0]), jnp.zeros(4)
     assert_allclose(jax.jit(dg.directional_metric)(u, v, CVAR_HALF), 1.5)
-
-
-def test_a_negative_factor_does_not_scale_a_preference_because_it_reverses_the_order_of_the_quantiles():
-    # u = 0 1 2 5 and CVaR at ½: ρ(u) = (0 + 1)/2 = ½, ρ(−u) = (−5 − 2)/2 = −3.5 ≠ −½; a positive factor scales it: ρ(2u) = 1
-    u, zero = jnp.array([5.0, 0.0, 2.0, 1.0]), jnp.zeros(4)
-    assert_allclose(
-        [dg.directional_metric(f * u, zero, CVAR_HALF) for f in (1.0, 2.0, 0.0, -1.0)],
-        [0.5, 1.0, 0.0, -3.5],
-    )
 
 
 @pytest.mark.parametrize("p", [1.0, 2.0])
@@ -96,20 +84,15 @@ def test_wasserstein_agrees_with_scipy(p, key):
     assert_allclose(dg.wasserstein(jnp.asarray(u), jnp.asarray(v), p), order, rtol=1e-5)
 
 
-def test_wasserstein_of_order_below_one_is_refused():
-    with pytest.raises(ValueError, match="at least 1"):
-        dg.wasserstein(jnp.zeros(2), jnp.zeros(2), 0.5)
-
-
-def test_quantiles_in_order_by_hand():
-    # steps of log(1 + e^0) = log 2 and log(1 + e^log 3) = log 4 about the mean 1: they start at 1 - (2 log 2 + log 4) / 3
+def test_monotone_quantiles_by_hand():
+    # gaps log(1 + e^0) = log 2 and log(1 + e^log 3) = log 4 about the mean 1
     first = 1 - 4 * np.log(2) / 3
     want = [first, first + np.log(2), first + 3 * np.log(2)]
     assert_allclose(monotone_quantiles(jnp.array([1.0, 5.0, 5.0 + np.log(3)])), want, rtol=1e-6)
 
 
 @pytest.mark.parametrize("k", [1, 2, 64])
-def test_quantiles_in_order_do_not_cross_and_have_the_mean_that_they_are_given(k, key):
+def test_monotone_quantiles_do_not_cross_and_have_the_given_mean(k, key):
     outputs = 10 * jax.random.normal(key, (100, k))
     z = monotone_quantiles(outputs)
     assert z.shape == (100, k)
@@ -120,11 +103,6 @@ def test_quantiles_in_order_do_not_cross_and_have_the_mean_that_they_are_given(k
 def test_huber_is_quadratic_inside_and_linear_outside_by_hand():
     # |u| ≤ 2: ½·1² = 0.5; beyond: 2·(5 - 1) = 8
     assert_allclose(huber(jnp.array([1.0, -1.0, 5.0, -5.0]), 2.0)[0], [0.5, 0.5, 8.0, 8.0])
-
-
-def test_the_slope_of_huber_is_its_derivative(key):
-    u = 3 * jax.random.normal(key, (50,))
-    assert_allclose(jax.vmap(jax.grad(lambda u: huber(u, 1.0)[0]))(u), huber(u, 1.0)[1], rtol=1e-6)
 
 
 def test_quantile_huber_loss_by_hand():
@@ -139,7 +117,7 @@ def test_quantile_huber_loss_by_hand():
 
 
 @pytest.mark.parametrize(("k", "j"), [(1, 1), (3, 40), (40, 3), (17, 16)])
-def test_quantile_huber_and_its_derivatives_are_those_of_all_residuals_laid_out(k, j, key):
+def test_quantile_huber_loss_and_its_gradients_match_numpy(k, j, key):
     z, y = 3 * jax.random.normal(key, (5, k)), 3 * jax.random.normal(jax.random.key(1), (2, 5, j))
 
     def laid_out(z, y, kappa):
@@ -161,16 +139,9 @@ def test_quantile_huber_and_its_derivatives_are_those_of_all_residuals_laid_out(
     )
 
 
-def test_quantile_huber_of_one_quantile_is_half_the_huber_loss(key):
-    z, y = jax.random.normal(key, (2, 6, 1))
-    assert_allclose(
-        dg.quantile_huber_loss(z, y, kappa=0.3), 0.5 * huber(y - z, 0.3)[0][:, 0], rtol=1e-6
-    )
-
-
 @pytest.mark.parametrize("i", range(4))
-def test_quantile_huber_is_minimised_by_the_empirical_quantile(i, key):
-    # 101·τᵢ is no whole number for K = 4, so the empirical quantile is one of the samples, and no sample does better
+def test_quantile_huber_loss_is_minimal_at_empirical_quantiles(i, key):
+    # 101·τᵢ is no whole number for K = 4, so that the empirical quantile is one of the samples
     samples = jax.random.normal(key, (101,))
     losses = jax.vmap(
         lambda x: dg.quantile_huber_loss(jnp.zeros(4).at[i].set(x), samples, kappa=1e-3)
@@ -181,7 +152,7 @@ def test_quantile_huber_is_minimised_by_the_empirical_quantile(i, key):
     assert_allclose(samples[losses.argmin()], expected)
 
 
-def test_quantile_huber_and_its_derivatives_on_an_accelerator_are_those_on_a_cpu(elsewhere):
+def test_quantile_huber_loss_on_an_accelerator_is_that_on_a_cpu(elsewhere):
     quantiles, target = jnp.asarray(np.random.default_rng(0).normal(size=(2, 6, 5)), jnp.float32)
 
     def both():
