@@ -26,7 +26,7 @@ from dgae_jax.learn.build import make_task, make_trainer, seed_keys
 
 @dataclass(frozen=True)
 class Arguments:
-    """What to measure."""
+    """Measurements."""
 
     json: Path = Path("benchmarks/results/gpu.json")
     """File to write [path]."""

@@ -47,7 +47,7 @@ Name = Literal[
 
 @dataclass(frozen=True)
 class Arguments:
-    """What to train."""
+    """Runs."""
 
     critics: tuple[Name, ...] = get_args(Name)
     """Critics, of `MEASURED`."""

@@ -107,11 +107,8 @@ def rejax(task: str, width: int, envs: int, seconds: float) -> float:
         normalize_rewards=True,
         total_timesteps=10**6,
     )
-    state, step, clock = (
-        jax.jit(algo.init_state)(jax.random.key(0)),
-        jax.jit(algo.train_iteration),
-        _Clock(seconds),
-    )
+    state, step = jax.jit(algo.init_state)(jax.random.key(0)), jax.jit(algo.train_iteration)
+    clock = _Clock(seconds)
     while True:
         state = jax.block_until_ready(step(state))
         if not clock.tick():

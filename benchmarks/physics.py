@@ -7,7 +7,7 @@ those of C MuJoCo on one thread. It then compares one environment step with Gymn
 the same state, in states visited by random and held actions and by the policies of `--runs`.
 
 On a CPU seconds are those that the process used, so keep it on one core. With `--device gpu` the
-engines in JAX are measured on the GPU, by the clock, and nothing else should run meanwhile.
+engines in JAX are measured on the GPU, by the clock, and nothing else should run.
 """
 
 import time
@@ -35,7 +35,7 @@ from dgae_jax.run import directory
 
 @dataclass(frozen=True)
 class Arguments:
-    """What to measure."""
+    """Measurements."""
 
     tasks: tuple[str, ...] = tuple(TASKS)
     """Tasks."""

@@ -2,7 +2,7 @@
 
     python benchmarks/seeds.py --json benchmarks/results/seeds.json
 
-Samples per second of all seeds together. Nothing else should run on the machine meanwhile.
+Samples per second of all seeds together. Nothing else should run on the machine.
 """
 
 import dataclasses
@@ -17,13 +17,13 @@ import tyro
 from throughput import iteration, setting
 
 from dgae_jax.configs.resolved import ResolvedConfig
-from dgae_jax.physics.cores import cores
+from dgae_jax.physics.registry import cores
 from dgae_jax.run import runtime
 
 
 @dataclass(frozen=True)
 class Arguments:
-    """What to measure."""
+    """Measurements."""
 
     seconds: float = 5.0
     """Time to measure each way, after compilation [s]."""

@@ -59,9 +59,8 @@ def main() -> int:
         print(f"error: the run ended with exit code {code}", file=sys.stderr)
         return 1
     steps = metrics.read(arguments.run_dir / "metrics.jsonl")[-1]["steps"]
-    print(
-        f"{steps:,} samples in {arguments.minutes:g} minutes; exit code {code} {stopping:.1f} s after"
-    )
+    print(f"{steps:,} samples in {arguments.minutes:g} minutes")
+    print(f"exit code {code}, {stopping:.1f} s after SIGTERM")
     grown = False
     for name, unit, slack in (("rss", " MB", 1.05), ("files", "", 1.0), ("threads", "", 1.0)):
         column = [row[name] for row in rows]

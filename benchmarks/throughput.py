@@ -9,7 +9,7 @@ and of rejax runs on our own `jax` engine.
 
 The roofline is the time of an iteration in which all cores do nothing but simulate (C MuJoCo),
 multiply matrices (the operations that the program counts, at the highest rate measured here) and
-compute the quantile-Huber loss (at the rate measured here). Nothing else should run meanwhile.
+compute the quantile-Huber loss (at the rate measured here). Nothing else should run.
 """
 
 import dataclasses
@@ -40,14 +40,14 @@ from dgae_jax.learn.build import make_policy, make_task, make_trainer, seed_keys
 from dgae_jax.learn.iteration import _estimate, _roll_out, sampler
 from dgae_jax.learn.parallel import COMPILER_OPTIONS
 from dgae_jax.learn.types import InferenceState
-from dgae_jax.physics.cores import cores
+from dgae_jax.physics.registry import cores
 from dgae_jax.run import runtime
 from dgae_jax.run.options import RunOptions
 
 
 @dataclass(frozen=True)
 class Arguments:
-    """What to measure."""
+    """Measurements."""
 
     seconds: float = 10.0
     """Time to measure each setting, after compilation [s]."""

@@ -38,7 +38,7 @@ CALLS = {
 
 @dataclass(frozen=True)
 class Arguments:
-    """What to count."""
+    """Size of the measurement."""
 
     num_envs: int = 2048
     """Parallel envs [envs]."""
@@ -61,7 +61,7 @@ NONE = Counts(np.float32(0), np.float32(0), np.float32(0))
 
 
 def counted(f: Callable, platform: str | None = None) -> Callable:
-    """`counted(f)(*args) -> (f(*args), Counts)`, as `platform` would run it, by default an accelerator."""
+    """Return `g(*args) -> (f(*args), Counts)` on a platform, by default an accelerator."""
 
     def count(*args: Any) -> tuple[Any, Counts]:
         program, shape = jax.make_jaxpr(f, return_shape=True)(*args)
