@@ -1,6 +1,7 @@
 """States of the four models, and the steps of C MuJoCo and of the engines from them."""
 
 import functools
+import math
 from importlib.util import find_spec
 
 import jax
@@ -79,17 +80,21 @@ def reference(name):
     return PhysicsState(*(np.stack(x) for x in zip(*after, strict=True))), np.array(contacts)
 
 
+def start(physics, name, *shape):
+    """The first states, with a batch of `shape`, and their controls."""
+    fields = (x[: math.prod(shape)].reshape(*shape, -1) for x in states(name))
+    qpos, qvel, warmstart, ctrl = (jnp.asarray(x, float) for x in fields)
+    return physics.init(qpos, qvel)._replace(qacc_warmstart=warmstart), ctrl
+
+
 @functools.cache
 def stepped(name, engine, *, x64=False):
     """The control interval by an engine."""
     with jax.enable_x64(x64):
         spec, skip = load_spec(GYM_TASKS[name].FILE["v4"]), GYM_TASKS[name].FRAME_SKIP
         physics = make_physics(engine, spec, skip, reads_of(name))
-        qpos, qvel, warmstart, ctrl = (
-            jnp.asarray(x, float if x64 else jnp.float32) for x in states(name)
-        )
-        state = physics.init(qpos, qvel)._replace(qacc_warmstart=warmstart)
-        return jax.tree.map(np.asarray, jax.jit(jax.vmap(physics.step))(state, ctrl))
+        after = jax.jit(jax.vmap(physics.step))(*start(physics, name, COUNT))
+        return jax.tree.map(np.asarray, after)
 
 
 def errors(name, engine, *, x64=False):

@@ -22,16 +22,13 @@ def check_env(env: Env) -> None:
     after = _traced("step", env.step, before, action)
     for state, where in ((before, "reset"), (after, "step")):
         if getattr(state.obs, "shape", None) != (_size(env, "observation_size"),):
-            raise ValueError(
-                f"the observation of its {where} has shape {_shapes(state.obs)},"
-                " and must be one array [observation_size]"
-            )
+            found = f"the observation of its {where} has shape {_shapes(state.obs)}"
+            raise ValueError(f"{found}, and must be one array [observation_size]")
         for name in ("reward", "done"):
             value = getattr(state, name)
             if getattr(value, "shape", None) != () or not jnp.issubdtype(value.dtype, jnp.floating):
-                raise ValueError(
-                    f"the {name} of its {where} is {value}, and must be a single real number"
-                )
+                found = f"the {name} of its {where} is {value}"
+                raise ValueError(f"{found}, and must be a single real number")
     _check_structure(before, after)
 
 
@@ -51,16 +48,13 @@ def _traced(name: str, function: Any, *arguments: Any) -> Any:
 
 
 def _check_structure(before: Any, after: Any) -> None:
-    leaves, new_leaves = (
-        dict(jax.tree_util.tree_flatten_with_path(state)[0]) for state in (before, after)
-    )
+    flatten = jax.tree_util.tree_flatten_with_path
+    leaves, new_leaves = (dict(flatten(state)[0]) for state in (before, after))
     for path in leaves | new_leaves:
         old, new = (_shapes(each.get(path)) for each in (leaves, new_leaves))
         if old != new:
-            raise ValueError(
-                f"its step turns state{jax.tree_util.keystr(path)} from {old} into {new},"
-                " and must leave it as it is"
-            )
+            found = f"its step turns state{jax.tree_util.keystr(path)} from {old} into {new}"
+            raise ValueError(f"{found}, and must leave it as it is")
 
 
 def _shapes(tree: Any) -> str:

@@ -62,9 +62,8 @@ def make_gym_env(name: str, **parameters) -> gymnasium.Env:
         vector = isinstance(space, Box) and len(space.shape) == 1
         if not vector or (kind == "actions" and np.dtype(space.dtype).kind != "f"):
             env.close()
-            raise ValueError(
-                f"its {kind} are {space}, and must be a Box with one axis of real numbers"
-            )
+            allowed = "a Box with one axis of real numbers"
+            raise ValueError(f"its {kind} are {space}, and must be {allowed}")
     return ClipAction(env)
 
 
@@ -92,9 +91,7 @@ class _Envs:
             if at[1] == 0 and (i >= len(self.envs) or self.at[i] != at):
                 self._begin(i, at[0])
             if self.at[i] != at:
-                raise RuntimeError(
-                    "a Gymnasium env only goes forward, and cannot continue from an earlier state"
-                )
+                raise RuntimeError("a Gymnasium env only goes forward, never back to a state")
             obs[i], reward[i], terminated[i], truncated[i], _ = self.envs[i].step(actions[i])
             self.at[i] = (at[0], at[1] + 1)
 

@@ -29,9 +29,7 @@ class PlaygroundTask(ThirdPartyEnv):
         obs = _policy_obs(jax.eval_shape(env.reset, jax.random.key(0)).obs)
         shape = getattr(obs, "shape", None)
         if shape is None or len(shape) != 1:
-            raise ValueError(
-                "its observations must be one array with one axis, or have one named state"
-            )
+            raise ValueError("its observations must be one vector, or have one named state")
         self._env = EpisodeWrapper(env, episode_length, action_repeat)
         self.backend, self.observation_size, self.action_size = physics, shape[0], env.action_size
         self.action_range = -jnp.ones(self.action_size), jnp.ones(self.action_size)
@@ -71,10 +69,8 @@ def make_playground(name: str, physics: str, **parameters) -> Env:
             near = get_close_matches(name, registry.ALL_ENVS, 3) or dm_control_suite.ALL_ENVS
             raise ValueError(f"Playground has no {name}, but {', '.join(near)}")
         if name not in dm_control_suite.ALL_ENVS and not MENAGERIE_PATH.exists():
-            raise ValueError(
-                f"its robot is in mujoco_menagerie, which Playground looks for in {MENAGERIE_PATH}"
-                " and would download"
-            )
+            where = f"which Playground looks for in {MENAGERIE_PATH} and would download"
+            raise ValueError(f"its robot is in mujoco_menagerie, {where}")
         config: Any = registry.get_default_config(name).lock()  # refuses unknown names
         try:
             config.update_from_flattened_dict({"impl": IMPL[physics], **parameters})

@@ -112,10 +112,8 @@ def _brax(name: str) -> EnvSpec:
 
 def _playground(name: str) -> EnvSpec:
     if find_spec("mujoco_playground") is None:
-        raise ValueError(
-            "used with the package playground, which is not installed:"
-            ' pip install "dgae_jax[playground]"'
-        )
+        install = 'pip install "dgae_jax[playground]"'
+        raise ValueError(f"used with the package playground, which is not installed: {install}")
 
     def build(physics, version, **task_parameters) -> "Env":
         from dgae_jax.envs.playground import make_playground
@@ -137,10 +135,8 @@ def _gymnasium(name: str) -> EnvSpec:
 def _custom(name: str) -> EnvSpec:
     env = CUSTOM_ENVS.get(CUSTOM + name)
     if env is None:
-        raise ValueError(
-            "given as an object from Python: dgae_jax.train(config, run_dir, env=…),"
-            " load_policy(run_dir, env=…)"
-        )
+        calls = "dgae_jax.train(config, run_dir, env=…), load_policy(run_dir, env=…)"
+        raise ValueError(f"given as an object from Python: {calls}")
 
     def build(physics, version) -> "Env":
         from dgae_jax.envs.custom import make_custom
@@ -153,10 +149,7 @@ def _custom(name: str) -> EnvSpec:
 PREFIXES = {BRAX: _brax, PLAYGROUND: _playground, GYMNASIUM: _gymnasium, CUSTOM: _custom}
 """Lookup of the name after a prefix; raises ValueError with "one of …" for an unknown one."""
 
-NAMES = (
-    f"one of {', '.join(TASKS)}, or {BRAX}NAME, {PLAYGROUND}NAME or {GYMNASIUM}ID"
-    " for a third-party task"
-)
+NAMES = f"one of {', '.join(TASKS)}, or brax:NAME, playground:NAME or gymnasium:ID"
 """The names that a task may have, for messages."""
 
 

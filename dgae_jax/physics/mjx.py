@@ -21,8 +21,7 @@ with contextlib.redirect_stdout(io.StringIO()):  # MJX prints that Warp is not i
 
 def mjx(spec: mujoco.MjSpec, frame_skip: int, reads: Reads) -> Physics:
     """Build MJX over its JAX code, on any device."""
-    model, bodies = _compile(spec, reads, "mjx")
-    device_model = _put_model(model, "jax", "mjx")
+    model, device_model, bodies = _compile(spec, reads, "mjx", "jax")
 
     @jax.default_matmul_precision("highest")  # TF32 on GPUs is too coarse for dynamics
     def step(state: PhysicsState, ctrl: Array) -> PhysicsState:
@@ -43,10 +42,9 @@ def mjx_warp(spec: mujoco.MjSpec, frame_skip: int, reads: Reads) -> Physics:
     import warp  # pyright: ignore[reportMissingImports]
 
     warp.config.log_level = warp.LOG_WARNING  # it announces itself and every kernel that it loads
-    model, bodies = _compile(spec, reads, "mjx-warp")
-    device_model: Any = _put_model(model, "warp", "mjx-warp").tree_replace(
-        {"opt._impl.run_rne_postconstraint": reads.forces}
-    )
+    model, device_model, bodies = _compile(spec, reads, "mjx-warp", "warp")
+    forces = {"opt._impl.run_rne_postconstraint": reads.forces}
+    device_model: Any = device_model.tree_replace(forces)
     contacts = upstream.make_data(model, impl="warp")._impl.naconmax
 
     def batched_step(state: PhysicsState, ctrl: Array) -> PhysicsState:
@@ -65,19 +63,15 @@ def mjx_warp(spec: mujoco.MjSpec, frame_skip: int, reads: Reads) -> Physics:
     return Physics(model, engine.single_env(batched_step), "mjx-warp", reads)
 
 
-def _compile(spec: mujoco.MjSpec, reads: Reads, name: str):
-    """Return the model and the ids of the bodies to read."""
+def _compile(spec: mujoco.MjSpec, reads: Reads, name: str, impl: str):
+    """Return the model, MJX's model, and the ids of the bodies to read."""
     spec = spec.copy()
     for numeric in list(spec.numerics):  # MJX 3.17 takes the first for its own limit on contacts
         spec.delete(numeric)
     model = spec.compile()
     engine.refuse_hidden_state(model, name)
-    return model, engine.body_ids(model, reads)
-
-
-def _put_model(model: mujoco.MjModel, impl: str, name: str) -> upstream.Model:
     try:
-        return upstream.put_model(model, impl=impl)
+        return model, upstream.put_model(model, impl=impl), engine.body_ids(model, reads)
     except NotImplementedError as reason:
         raise ValueError(f"physics {name} does not cover this model: {reason}") from None
 

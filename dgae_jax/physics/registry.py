@@ -46,17 +46,13 @@ class Engine(NamedTuple):
     on_host: bool = False
     """True if it simulates on the CPU whatever JAX's device is."""
     package: str | None = None
-    """Module that must be installed beside the dependencies."""
-    extra: str | None = None
-    """The extra of this package that installs it."""
+    """Module, and extra of this package, that must be installed beside the dependencies."""
 
 
 ENGINES = {
     "jax": Engine(_jax, "MuJoCo's stages in our own JAX code, CPU or GPU"),
     "mjx": Engine(_mjx, "google-deepmind's MuJoCo MJX, unchanged, any device"),
-    "mjx-warp": Engine(
-        _mjx_warp, "MuJoCo MJX over MuJoCo Warp, NVIDIA GPUs", package="warp", extra="warp"
-    ),
+    "mjx-warp": Engine(_mjx_warp, "MuJoCo MJX over MuJoCo Warp, NVIDIA GPUs", package="warp"),
     "native": Engine(_native, "C MuJoCo, CPU", on_host=True),
 }
 
@@ -69,12 +65,10 @@ def require(name: str) -> None:
     """
     if name not in ENGINES:
         raise ValueError(f"unknown physics {name!r}: must be one of {', '.join(ENGINES)}")
-    package, extra = ENGINES[name].package, ENGINES[name].extra
+    package = ENGINES[name].package
     if package is not None and find_spec(package) is None:
-        install = f'pip install "dgae_jax[{extra}]"'
-        raise ValueError(
-            f"physics {name} needs the package {package}, which is not installed: {install}"
-        )
+        reason = f"needs the package {package}, which is not installed"
+        raise ValueError(f'physics {name} {reason}: pip install "dgae_jax[{package}]"')
 
 
 def make_physics(name: str, spec: "mujoco.MjSpec", frame_skip: int, reads: "Reads") -> "Physics":

@@ -39,8 +39,8 @@ def test_rollout_equals_gymnasium_step_by_step(name, steps, limit, key):
     (_, step), first = jax.jit(roll_out, static_argnums=(0, 2, 3))(env, key, steps, limit)
     high, low = np.asarray(first.env.pipeline_state.seed, np.uint64).T
     for i in range(ENVS):
-        steps = min(limit, gymnasium.spec(name).max_episode_steps)
-        gym = gymnasium.make(name, max_episode_steps=steps)
+        longest = min(limit, gymnasium.spec(name).max_episode_steps)
+        gym = gymnasium.make(name, max_episode_steps=longest)
         obs, _ = gym.reset(seed=int(high[i]) << 32 | int(low[i]))
         over, t = False, 0
         while not over:

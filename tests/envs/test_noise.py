@@ -11,17 +11,12 @@ from dgae_jax.learn.rollout import rollout, start
 from tests.probes import Constant, Counter
 
 
-def collect(env, key, num_steps=400):
+def collect(env, key):
     def act(key, obs):
         return jnp.zeros((obs.shape[0], 1)), jnp.zeros(obs.shape[0])
 
-    return rollout(
-        env,
-        act,
-        start(env, jax.random.split(key, 16)),
-        jax.random.split(key, (num_steps, 16)),
-        episode_length=50,
-    )[1]
+    first, keys = start(env, jax.random.split(key, 16)), jax.random.split(key, (400, 16))
+    return rollout(env, act, first, keys, episode_length=50)[1]
 
 
 def test_task_is_wrapped_only_with_noise():

@@ -108,8 +108,3 @@ def test_building_a_brax_env_prints_nothing(monkeypatch, tmp_path, capfd):
     dg.make_env("brax:halfcheetah")
     assert capfd.readouterr() == ("", "")
     assert list(tmp_path.iterdir()) == []
-
-
-def test_brax_finds_our_tasks():
-    env = brax.envs.get_environment("dgae_swimmer", physics="native")
-    assert env.observation_size == 8

@@ -35,9 +35,7 @@ print(sorted({"jax", "mujoco", "brax", "flax", "gymnasium", "warp"} & set(sys.mo
 
 
 def test_unknown_engine_is_refused_with_the_names():
-    with pytest.raises(
-        ValueError, match="unknown physics 'bullet': must be one of jax, mjx, mjx-warp, native"
-    ):
+    with pytest.raises(ValueError, match="'bullet': must be one of jax, mjx, mjx-warp, native"):
         make_physics("bullet", load_spec("hopper.xml"), 4, Reads())
 
 

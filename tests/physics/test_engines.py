@@ -56,17 +56,6 @@ def test_float64_control_interval_differs_from_c_by_rounding(engine, name):
     assert_allclose(got.cfrc_ext, want.cfrc_ext, atol=1e-4, rtol=1e-5)
 
 
-@pytest.mark.parametrize(
-    ("engine", "x64"),
-    [pytest.param("mjx", True, marks=slow), pytest.param("mjx-warp", False, marks=(WARP, slow))],
-)
-def test_ant_in_mjx_agrees_with_c_in_most_states(engine, x64):
-    # until upstream mends it: half of the states agree to 1e-3, fallen ones do not
-    error = errors("ant", engine, x64=x64)
-    assert np.median(error) < 1e-3
-    assert error.max() < 10
-
-
 @pytest.mark.parametrize("name", MODELS)
 def test_states_have_contacts_where_a_model_has_any(name):
     contacts = reference(name)[1]

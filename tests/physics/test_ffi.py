@@ -73,9 +73,7 @@ print(json.dumps({"hits": hits, "qpos": after.qpos.tolist()}))
 """
 
 
-def test_another_process_finds_native_physics_in_the_cache(
-    tmp_path,
-):
+def test_another_process_finds_native_physics_in_the_cache(tmp_path):
     command = [sys.executable, "-c", PROGRAM, tmp_path]
     first, second = (
         json.loads(subprocess.run(command, cwd=ROOT, capture_output=True, check=True).stdout)

@@ -13,7 +13,7 @@ from dgae_jax.envs.task import load_spec
 from dgae_jax.physics.engine import Reads
 from dgae_jax.physics.registry import make_physics
 from tests.helpers import ROOT
-from tests.parity import FEET, WARP, reference, states
+from tests.parity import FEET, WARP, reference, start
 
 
 def test_a_capsule_on_the_ground_moves_as_in_c():
@@ -31,12 +31,8 @@ def test_a_capsule_on_the_ground_moves_as_in_c():
 
 @WARP
 def test_warp_steps_any_nesting_of_vmaps():
-    physics, want = (
-        make_physics("mjx-warp", load_spec("hopper.xml"), 4, Reads()),
-        reference("hopper")[0],
-    )
-    qpos, qvel, warmstart, ctrl = (jnp.asarray(x) for x in states("hopper"))
-    state = physics.init(qpos, qvel)._replace(qacc_warmstart=warmstart)
+    physics = make_physics("mjx-warp", load_spec("hopper.xml"), 4, Reads())
+    want, (state, ctrl) = reference("hopper")[0], start(physics, "hopper", 128)
     many = jax.jit(jax.vmap(physics.step))(state, ctrl)
     few = jax.jit(jax.vmap(physics.step))(*jax.tree.map(lambda x: x[:5], (state, ctrl)))
     grid = jax.tree.map(lambda x: x[:12].reshape(3, 4, *x.shape[1:]), (state, ctrl))

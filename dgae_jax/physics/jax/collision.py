@@ -48,8 +48,8 @@ class ContactGroup(NamedTuple):
     geom2: Geoms
     plane: np.ndarray
     """[K 4] normal and offset of the ground [1, m]; empty without."""
-    frictionless: bool
-    """True if `contact.dim` is 1; it is 3 otherwise."""
+    dim: int
+    """1 without friction, else 3."""
     max_contacts: int
     """Number of contacts that are kept, the nearest ones."""
 
@@ -57,6 +57,7 @@ class ContactGroup(NamedTuple):
 class Contact(NamedTuple):
     """Fields of `mjContact` of K contacts in N envs."""
 
+    dim: int
     params: ContactParams
     """Their constants, as arrays."""
     dist: Float[Array, "K N"]
@@ -79,10 +80,10 @@ def known_max_contacts(name: str, model: mujoco.MjModel) -> int | None:
 def contact_groups(m: Model, max_contacts: int | None = None) -> list[ContactGroup]:
     """Read the possible contacts; `max_contacts` bounds those with the ground."""
     mj = m.mj
-    pairs: dict[tuple[bool, bool], list[tuple[int, int]]] = {}
+    pairs: dict[tuple[bool, int], list[tuple[int, int]]] = {}
     for pair in _geom_pairs(mj):
-        kind = bool(mj.geom_type[pair[0]] == PLANE), bool(max(mj.geom_condim[list(pair)]) == 1)
-        pairs.setdefault(kind, []).append(pair)
+        dim = 1 if max(mj.geom_condim[list(pair)]) == 1 else 3
+        pairs.setdefault((bool(mj.geom_type[pair[0]] == PLANE), dim), []).append(pair)
     return [_group(m, np.array(p), *kind, max_contacts) for kind, p in pairs.items()]
 
 
@@ -101,7 +102,7 @@ def _geom_pairs(model: mujoco.MjModel) -> Iterator[tuple[int, int]]:
 
 
 def _group(
-    m: Model, pairs: np.ndarray, ground: bool, frictionless: bool, max_contacts: int | None
+    m: Model, pairs: np.ndarray, ground: bool, dim: int, max_contacts: int | None
 ) -> ContactGroup:
     mj = m.mj
     if ground:  # a capsule touches the ground with either end
@@ -115,7 +116,7 @@ def _group(
     bodies = mj.geom_bodyid[pairs]
     friction = np.maximum(mj.geom_friction[one, 0], mj.geom_friction[two, 0])
     invweight = mj.body_invweight0[bodies, 0].sum(1)
-    if not frictionless:
+    if dim == 3:
         invweight = 2 * friction**2 / mj.opt.impratio * (1 + friction**2) * invweight
     solref, solimp = mj.geom_solref[pairs].mean(1), mj.geom_solimp[pairs].mean(1)
     solver = SolverParams.create(mj, mj.geom_margin[pairs].sum(1), invweight, solref, solimp)
@@ -123,11 +124,11 @@ def _group(
     params = ContactParams(solver, friction, dofs[:, 1] - dofs[:, 0], bodies)
     if not ground:
         plane = np.empty((0, 4))
-        return ContactGroup(params, _geoms(m, one), geom2, plane, frictionless, len(pairs))
+        return ContactGroup(params, _geoms(m, one), geom2, plane, dim, len(pairs))
     normals = np.array([quat_to_mat(mj.geom_quat[g])[:, 2] for g in one])
     plane = np.c_[normals, (normals * mj.geom_pos[one]).sum(1)]
     kept = min(len(pairs), len(pairs) if max_contacts is None else max_contacts)
-    return ContactGroup(params, None, geom2, plane, frictionless, kept)
+    return ContactGroup(params, None, geom2, plane, dim, kept)
 
 
 def _geoms(m: Model, geoms: np.ndarray) -> Geoms:
@@ -202,7 +203,7 @@ def _nearest(group: ContactGroup, dist: Array, *rest: Array) -> Contact:
     """Keep all contacts of a group, or the `max_contacts` nearest."""
     count = group.max_contacts
     if count == len(dist):
-        return Contact(as_arrays(group.params, dist.dtype), dist, *rest)
+        return Contact(group.dim, as_arrays(group.params, dist.dtype), dist, *rest)
     chosen = jax.lax.top_k(-dist.T, count)[1].T
 
     def constants(x: np.ndarray) -> Array:
@@ -214,4 +215,4 @@ def _nearest(group: ContactGroup, dist: Array, *rest: Array) -> Contact:
     def take(x: Array) -> Array:
         return jnp.take_along_axis(x, chosen.reshape(count, *(1,) * (x.ndim - 2), -1), 0)
 
-    return Contact(jax.tree.map(constants, group.params), *map(take, (dist, *rest)))
+    return Contact(group.dim, jax.tree.map(constants, group.params), *map(take, (dist, *rest)))

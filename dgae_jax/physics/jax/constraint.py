@@ -12,7 +12,7 @@ import mujoco
 import numpy as np
 from jaxtyping import Array, Float
 
-from dgae_jax.physics.jax.collision import Contact, ContactGroup, as_arrays
+from dgae_jax.physics.jax.collision import Contact, as_arrays
 from dgae_jax.physics.jax.math import combine, constant, cross, dot
 from dgae_jax.physics.jax.model import Model, SolverParams
 from dgae_jax.physics.jax.smooth import Smooth
@@ -30,17 +30,11 @@ class Constraint(NamedTuple):
 
 
 def make_constraint(
-    m: Model,
-    groups: list[ContactGroup],
-    contacts: list[Contact],
-    smooth: Smooth,
-    qpos: Float[Array, "Q N"],
-    qvel: Float[Array, "V N"],
+    m: Model, contacts: list[Contact], smooth: Smooth, qpos: Array, qvel: Array
 ) -> Constraint:
     """Compute the rows of all limits, then of all contacts."""
     rows = [_limit_rows(m, qpos, qvel)] if m.mj.jnt_limited.any() else []
-    for group, contact in zip(groups, contacts, strict=True):
-        rows.append(_contact_rows(group.frictionless, contact, smooth, qvel))
+    rows += [_contact_rows(contact, smooth, qvel) for contact in contacts]
     efc_J, efc_D, efc_aref = zip(*rows, strict=True)
     return Constraint(jnp.concatenate(efc_J, 1), jnp.concatenate(efc_D), jnp.concatenate(efc_aref))
 
@@ -58,13 +52,13 @@ def _limit_rows(m: Model, qpos: Array, qvel: Array) -> Constraint:
     return _rows(as_arrays(params, dtype), axis * jnp.where(at_low, 1, -1), dist, qvel)
 
 
-def _contact_rows(frictionless: bool, contact: Contact, smooth: Smooth, qvel: Array) -> Constraint:
+def _contact_rows(contact: Contact, smooth: Smooth, qvel: Array) -> Constraint:
     arm = contact.pos - smooth.subtree_com
     angular, linear = smooth.cdof[:, None, :3], smooth.cdof[:, None, 3:]
     velocity = linear + cross(angular, arm[None])
     velocity *= jnp.swapaxes(contact.params.dofs, 0, 1)[:, :, None]
     efc_J = normal = dot(velocity, contact.normal)
-    if not frictionless:  # the four edges of a pyramid
+    if contact.dim == 3:  # the four edges of a pyramid
         slides = [contact.params.friction * dot(velocity, t) for t in _tangents(contact)]
         efc_J = jnp.concatenate([normal + sign * s for s in slides for sign in (1, -1)], 1)
     edges = efc_J.shape[1] // normal.shape[1]
@@ -95,21 +89,17 @@ def _rows(params: SolverParams, efc_J: Array, dist: Array, qvel: Array) -> Const
 
 
 def rne_postconstraint(
-    m: Model,
-    groups: list[ContactGroup],
-    contacts: list[Contact],
-    subtree_com: Float[Array, "3 N"],
-    efc_force: Float[Array, "C N"],
+    m: Model, contacts: list[Contact], subtree_com: Array, efc_force: Float[Array, "C N"]
 ) -> Float[Array, "B 6 N"]:
     """Compute `cfrc_ext`: torque about the center of mass of the tree and force on each body."""
     nbody, start = m.mj.nbody, np.count_nonzero(m.mj.jnt_limited)
     cfrc_ext = jnp.zeros((nbody, 6, subtree_com.shape[-1]), subtree_com.dtype)
-    for group, contact in zip(groups, contacts, strict=True):
-        edges, count = 1 if group.frictionless else 4, len(contact.dist)
+    for contact in contacts:
+        edges, count = 1 if contact.dim == 1 else 4, len(contact.dist)
         pyramid = efc_force[start : start + edges * count].reshape(edges, count, -1)
         start += edges * count
         force = contact.normal * pyramid.sum(0)[:, None]
-        if not group.frictionless:
+        if contact.dim == 3:
             pairs = pyramid[:2], pyramid[2:]
             for tangent, (plus, minus) in zip(_tangents(contact), pairs, strict=True):
                 force += tangent * (contact.params.friction * (plus - minus))[:, None]

@@ -46,12 +46,11 @@ def jax_engine(
         if not groups and not model.jnt_limited.any():
             return math.solve(s.qM, s.qfrc_smooth), (xpos, cfrc_ext)
         contacts = collision(groups, s.frames)
-        constraint = make_constraint(m, groups, contacts, s, qpos, qvel)
+        constraint = make_constraint(m, contacts, s, qpos, qvel)
         problem = solver.Problem(s.qM, s.qfrc_smooth, *constraint)
         solution = solver.solve(problem, qacc_warmstart)
         if reads.forces:
-            efc_force = solution.efc_force
-            cfrc_ext = rne_postconstraint(m, groups, contacts, s.subtree_com, efc_force)
+            cfrc_ext = rne_postconstraint(m, contacts, s.subtree_com, solution.efc_force)
         return solution.qacc, (xpos, cfrc_ext)
 
     def rungekutta4(state: PhysicsState, ctrl: Array) -> PhysicsState:
