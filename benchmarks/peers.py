@@ -70,7 +70,7 @@ def steps_per_second(
 
     def make() -> gymnasium.Env:
         gymnasium.logger.min_level = gymnasium.logger.ERROR  # v4 is not the latest version
-        return gymnasium.make(TASKS[task].referees["v4"])
+        return gymnasium.make(TASKS[task].eval_envs["v4"])
 
     vec_env_cls = SubprocVecEnv if processes else DummyVecEnv
     env = VecNormalize(make_vec_env(make, envs, vec_env_cls=vec_env_cls))

@@ -78,7 +78,7 @@ def steps_per_second(run: Callable[[int], Any], envs: int, arguments: Arguments)
 def c_speed(name: str, envs: int, arguments: Arguments) -> float:
     """Return the speed of C MuJoCo on one thread, with random controls at every step."""
     env: Any = dg.make_env(name, physics="native")
-    model, rng = env._physics.model, np.random.default_rng(0)
+    model, rng = env.physics.model, np.random.default_rng(0)
     batch = Batch(model, envs, 1)
     batch.bind("qpos")[:] = model.qpos0
 
@@ -93,7 +93,7 @@ def c_speed(name: str, envs: int, arguments: Arguments) -> float:
 def engine_speed(name: str, engine: str, envs: int, arguments: Arguments) -> tuple[float, float]:
     """Return environment steps per second of an engine, and seconds to compile."""
     env: Any = dg.make_env(name, physics=engine)
-    physics = env._physics
+    physics = env.physics
 
     def some(state, key, count):
         def one(i, state):
@@ -109,7 +109,7 @@ def engine_speed(name: str, engine: str, envs: int, arguments: Arguments) -> tup
             return devices.divided(some, (0, None, None), 0)(state, key, count)
 
     qpos = jnp.broadcast_to(jnp.asarray(physics.model.qpos0), (envs, physics.model.nq))
-    state = physics.at_pose(qpos, jnp.zeros((envs, physics.model.nv)))
+    state = physics.init(qpos, jnp.zeros((envs, physics.model.nv)))
     since = arguments.clock()
     compiled = run.lower(state, jax.random.key(0), 1).compile()
     compiling = arguments.clock() - since
@@ -136,7 +136,7 @@ def speeds(arguments: Arguments) -> None:
 def gymnasium_task(name: str):
     """Return Gymnasium's v4 task."""
     gymnasium.logger.min_level = gymnasium.logger.ERROR
-    return gymnasium.make(TASKS[name].referees["v4"]).unwrapped
+    return gymnasium.make(TASKS[name].eval_envs["v4"]).unwrapped
 
 
 def visited(

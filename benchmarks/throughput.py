@@ -229,7 +229,7 @@ def _without_physics(config: ResolvedConfig) -> list[tuple[Callable, tuple]]:
 def c_seconds(task: str, envs: int, num_steps: int) -> float:
     """Return the seconds of C MuJoCo alone, on all cores, under random controls."""
     env: Any = dg.make_env(task, physics="native")
-    model, rng = env._physics.model, np.random.default_rng(0)
+    model, rng = env.physics.model, np.random.default_rng(0)
     batch = Batch(model, envs, min(cores(), envs))
     batch.bind("qpos")[:] = model.qpos0
 
