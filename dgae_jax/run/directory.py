@@ -53,22 +53,25 @@ def created(path: Path, config: ResolvedConfig, options: RunOptions) -> Iterator
     Raises:
         ConfigError: the directory holds anything else, or cannot be written.
     """
-    try:
+    with _writing(path):
         path.mkdir(parents=True, exist_ok=True)
         _check_empty(path)
-    except OSError as reason:
-        allowed = f"a directory that can be written ({reason.strerror})"
-        raise invalid("run_dir", path, allowed) from reason
     with locked(path):
         _check_empty(path)  # again: another process may have been quicker
-        try:
+        with _writing(path):
             (path / "checkpoints").mkdir(exist_ok=True)
             files.write_json(path / "manifest.json", {**_part(options), "resumed": []})
             write_config(path, config)
-        except OSError as reason:
-            allowed = f"a directory that can be written ({reason.strerror})"
-            raise invalid("run_dir", path, allowed) from reason
         yield
+
+
+@contextlib.contextmanager
+def _writing(path: Path) -> Iterator[None]:
+    try:
+        yield
+    except OSError as reason:
+        allowed = f"a directory that can be written ({reason.strerror})"
+        raise invalid("run_dir", path, allowed) from reason
 
 
 def _check_empty(path: Path) -> None:

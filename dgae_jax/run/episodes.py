@@ -38,9 +38,9 @@ class EvalStep(NamedTuple):
     reward: np.ndarray
     """Rewards [E], 0 where the episode has ended before."""
     alive: np.ndarray
-    """Whether each episode goes on after the step [E]."""
+    """False where an episode has ended, in this step or before [E]."""
     terminated: np.ndarray
-    """Whether each episode ended in this step other than by a time limit [E]."""
+    """True where an episode ended in this step other than by a time limit [E]."""
     snapshots: list[Any]
     """What `snapshot` returned for each env before the step."""
 
@@ -142,7 +142,7 @@ def _progress(step: int, config: ResolvedConfig, alive: int) -> str:
 
 @lru_cache(maxsize=1)
 def _greedy(config: ResolvedConfig, given: Any):
-    """Compile the mean action; `given` is the object that a custom task stands for now."""
+    """Compile the mean action; `given` is the object of a custom task."""
     return jax.jit(make_greedy(make_task(config), config))
 
 
@@ -178,8 +178,8 @@ def _fresh_envs(
 ) -> Any:
     """Return env states at the beginning of an episode [E].
 
-    They are taken from fresh training states, whose program is compiled already or will be: a
-    reset of Brax's takes half a minute to compile.
+    They are taken from fresh training states, to share their program: a reset of Brax's takes half
+    a minute to compile.
     """
     batches = -(-episodes // (config.num_seeds * config.num_envs))
     sequences = (np.random.SeedSequence((seed, i)) for i in range(batches))

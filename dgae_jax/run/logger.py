@@ -1,4 +1,4 @@
-"""What a run writes while it trains: metrics, checkpoints, evaluations and the learning curve."""
+"""Files of a run that grow: metrics, checkpoints, evaluations and the learning curve."""
 
 import gc
 import time
@@ -64,13 +64,13 @@ class RunLogger:
 
     @property
     def evaluated(self) -> bool:
-        """Whether the state after so many samples was evaluated."""
+        """True if the state after so many samples was evaluated."""
         return self.evaluations.has(self.steps)
 
     def append(self, state: TrainState, measured: dict[str, Any], count: int) -> float | None:
         """Add `count` iterations to the metrics and return the last mean return, if any."""
         rows = self.metrics.append(measured, count, time.monotonic() - self.began)
-        self.feed.rows(rows)
+        self.feed.log("rows", rows)
         if self.options.debug_nonfinite:
             for seed in sorted({row["seed"] for row in rows if row["nonfinite"]}):
                 self._save_incidents(state, seed)
@@ -79,7 +79,7 @@ class RunLogger:
         return float(np.mean(returns)) if returns else None
 
     def save(self, state: TrainState) -> None:
-        """Write a checkpoint from a copy: the state itself may be donated meanwhile."""
+        """Write a checkpoint from a copy: the state itself may be donated."""
         keep = self.options.keep_checkpoints, self.evaluations.best
         directory, arrays = self.run_dir / "checkpoints", checkpoint.arrays_of(state)
         self._write(checkpoint.save, directory, self.config, arrays, self.steps, *keep)
@@ -91,7 +91,8 @@ class RunLogger:
         if not self.evaluated:
             self.pending.result()  # the checkpoint is on the disk before its evaluation
             self.evaluations.append(self.steps, result)
-            self.feed.evaluations([{"steps": self.steps, **one} for one in result["seeds"]])
+            rows = [{"steps": self.steps, **one} for one in result["seeds"]]
+            self.feed.log("evaluations", rows)
         self.draw()
         return result
 

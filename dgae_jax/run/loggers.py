@@ -24,9 +24,6 @@ from dgae_jax.configs.serial import flat, to_dict
 from dgae_jax.run import files, terminal
 from dgae_jax.run.metrics import EvaluationsFile
 
-Row = dict[str, Any]
-"""A row of `metrics.jsonl` or `evaluations.jsonl`: `steps`, `seed` and numbers by name."""
-
 ITERATIONS = 256
 """Most iterations that are read at once."""
 
@@ -41,7 +38,7 @@ MLFLOW_BATCH = 1000
 
 
 class Place(NamedTuple):
-    """What a logger is opened with."""
+    """A run directory, its configuration, and how far a logger has come."""
 
     run_dir: Path
     config: ResolvedConfig
@@ -66,37 +63,38 @@ class Place(NamedTuple):
         return {path: value for path, value in values.items() if value is not None}
 
 
+class Entry(NamedTuple):
+    """The finite numbers of one row of `metrics.jsonl` or `evaluations.jsonl`."""
+
+    seed: int
+    steps: int
+    seconds: float | None
+    """Time since the run began; None for an evaluation."""
+    values: dict[str, float]
+
+
 class MetricLogger(Protocol):
     """A logger that is open for one run directory; what it raises gives the logger up."""
 
-    def rows(self, rows: list[Row]) -> None:
-        """Take rows of metrics in their order, all seeds of each iteration."""
-
-    def evaluations(self, rows: list[Row]) -> None:
-        """Take the evaluations of all seeds."""
+    def log(self, entries: list[Entry]) -> None:
+        """Take entries in their order, of all seeds."""
 
     def close(self, paths: list[Path], finished: bool) -> None:
         """Take pictures and videos, and end; `finished` if the run reached its end."""
 
 
-def numbers(row: Row) -> dict[str, float]:
-    """Return the finite metrics of a row."""
-    return _finite({name: value for name, value in row.items() if name not in ("steps", "seed")})
-
-
-def scores(row: Row) -> dict[str, float]:
-    """Return the finite numbers of an evaluation."""
-    return _finite({f"evaluation/{name}": row[name] for name in ("return_mean", "return_std")})
+def _entry(part: str, row: dict[str, Any]) -> Entry:
+    if part == "rows":
+        values = {name: x for name, x in row.items() if name not in ("steps", "seed")}
+    else:
+        values = {f"evaluation/{name}": row[name] for name in ("return_mean", "return_std")}
+    there = {k: float(x) for k, x in values.items() if x is not None and math.isfinite(x)}
+    return Entry(row["seed"], row["steps"], row.get("seconds"), there)
 
 
 def _batches(items: Iterable[Any], size: int) -> Iterator[list[Any]]:
     left = iter(items)
     return iter(lambda: list(itertools.islice(left, size)), [])
-
-
-def _finite(values: dict[str, Any]) -> dict[str, float]:
-    there = {name: value for name, value in values.items() if value is not None}
-    return {name: float(value) for name, value in there.items() if math.isfinite(value)}
 
 
 class TensorBoard:
@@ -133,21 +131,13 @@ class TensorBoard:
         for writer in self.writers.values():
             writer.flush()
 
-    def rows(self, rows: list[Row]) -> None:
-        """Write a scalar per metric."""
-        self._scalars(rows, numbers)
-
-    def evaluations(self, rows: list[Row]) -> None:
-        """Write a scalar per statistic."""
-        self._scalars(rows, scores)
-
-    def _scalars(self, rows: list[Row], numbers_of: Callable[[Row], dict[str, float]]) -> None:
+    def log(self, entries: list[Entry]) -> None:
+        """Write a scalar per number."""
         from tensorboardX.proto.summary_pb2 import Summary
 
-        for row in rows:
-            pairs = numbers_of(row).items()
-            values = [Summary.Value(tag=name, simple_value=x) for name, x in pairs]
-            self._write(row["seed"], step=row["steps"], summary=Summary(value=values))
+        for entry in entries:
+            values = [Summary.Value(tag=k, simple_value=x) for k, x in entry.values.items()]
+            self._write(entry.seed, step=entry.steps, summary=Summary(value=values))
         self._flush()
 
     def close(self, paths: list[Path], finished: bool) -> None:
@@ -195,17 +185,12 @@ class WeightsAndBiases:
             if mode == "online":
                 terminal.say(f"{place.name(seed)} at {run.url}")
 
-    def rows(self, rows: list[Row]) -> None:
-        """Log the metrics."""
-        for row in rows:
-            self.last = row["steps"]
-            self.runs[row["seed"]].log({"steps": self.last, **numbers(row)}, step=2 * self.last)
-
-    def evaluations(self, rows: list[Row]) -> None:
-        """Log the statistics."""
-        for row in rows:
-            values = {"steps": row["steps"], **scores(row)}
-            self.runs[row["seed"]].log(values, step=2 * row["steps"] + 1)
+    def log(self, entries: list[Entry]) -> None:
+        """Log the numbers over samples."""
+        for entry in entries:
+            self.last, evaluation = max(self.last, entry.steps), entry.seconds is None
+            values = {"steps": entry.steps, **entry.values}
+            self.runs[entry.seed].log(values, step=2 * entry.steps + evaluation)
 
     def close(self, paths: list[Path], finished: bool) -> None:
         """Log images and videos, and finish."""
@@ -219,7 +204,7 @@ class WeightsAndBiases:
 
 
 def _wandb_mode() -> Any:
-    """Return the user's mode; without one online if it can be, as nobody may answer a prompt."""
+    """Return the user's mode; without one online if there is a login and a server: no prompts."""
     import wandb
     from requests.utils import get_environ_proxies, get_netrc_auth, select_proxy
 
@@ -281,30 +266,16 @@ class MLflow:
         own = None if self.server else (self.folder / "files").as_uri()
         return self.client.create_experiment(name, artifact_location=own)
 
-    def rows(self, rows: list[Row]) -> None:
-        """Log the metrics, at the times of the run."""
-        self._log(rows, numbers, lambda run, row: run.info.start_time + 1000 * row["seconds"])
-
-    def evaluations(self, rows: list[Row]) -> None:
-        """Log the statistics."""
-        now = 1000 * time.time()
-        self._log(rows, scores, lambda *_: now)
-
-    def _log(
-        self,
-        rows: list[Row],
-        numbers_of: Callable[[Row], dict[str, float]],
-        time_of: Callable[[Any, Row], float],
-    ) -> None:
+    def log(self, entries: list[Entry]) -> None:
+        """Log the numbers at the times of the run."""
         from mlflow.entities import Metric
 
         for seed, run in self.runs.items():
-            metrics = [
-                Metric(name, x, round(time_of(run, row)), row["steps"])
-                for row in rows
-                if row["seed"] == seed
-                for name, x in numbers_of(row).items()
-            ]
+            metrics = []
+            for entry in (entry for entry in entries if entry.seed == seed):
+                past = None if entry.seconds is None else 1000 * entry.seconds
+                at = round(1000 * time.time() if past is None else run.info.start_time + past)
+                metrics += [Metric(k, x, at, entry.steps) for k, x in entry.values.items()]
             for some in _batches(metrics, MLFLOW_BATCH):
                 self.client.log_batch(run.info.run_id, metrics=some, synchronous=True)
 
@@ -348,13 +319,9 @@ class LoggerFeed:
         for name in names:
             self._later(self._try, name, self._open, done)
 
-    def rows(self, rows: list[Row]) -> None:
-        """Log metrics of some iterations, all seeds of each."""
-        self._each(self._give, "rows", rows)
-
-    def evaluations(self, rows: list[Row]) -> None:
-        """Log one evaluation of all seeds."""
-        self._each(self._give, "evaluations", rows)
+    def log(self, part: str, rows: list[dict[str, Any]]) -> None:
+        """Log `rows` of metrics, all seeds of each iteration, or `evaluations`."""
+        self._each(self._give, part, rows)
 
     def close(self, finished: bool) -> None:
         """Wait until all is written; `finished` if the run reached its end."""
@@ -377,7 +344,7 @@ class LoggerFeed:
         except Exception as reason:  # a library, a network or a disk is not worth the run
             self.open.pop(name, None)
             why = f"{type(reason).__name__}: {reason}".strip().partition("\n")[0][:300]
-            rest = "the training goes on, and --resume adds what is missing"
+            rest = "the run continues, and --resume adds what is missing"
             terminal.warn(f"warning: --log {name} stops here ({why}); {rest}")
 
     def _open(self, name: str, done: int) -> None:
@@ -396,11 +363,11 @@ class LoggerFeed:
         evaluations = EvaluationsFile(self.run_dir / "evaluations.jsonl").rows
         self._give(name, "evaluations", [row for row in evaluations if row["steps"] <= done])
 
-    def _give(self, name: str, part: str, rows: list[Row]) -> None:
+    def _give(self, name: str, part: str, rows: list[dict[str, Any]]) -> None:
         """Pass on those of the rows that the logger lacks."""
         state = self.state[name]
         if new := [row for row in rows if row["steps"] > state[part]]:
-            getattr(self.open[name], part)(new)
+            self.open[name].log([_entry(part, row) for row in new])
             state[part] = new[-1]["steps"]
             files.write_json(self.path, self.state)
 

@@ -16,7 +16,7 @@ METRIC_LOGGERS = {"tensorboard": "tensorboardX", "wandb": "wandb", "mlflow": "ml
 
 @dataclass(frozen=True)
 class RunOptions:
-    """What a run leaves on this machine; nothing here changes its result."""
+    """Options that do not change the result of a run."""
 
     run_dir: Path | None = None
     """Directory to write, new or empty; by default runs/ENV-ALGO-SEED-TIME [path]."""

@@ -66,7 +66,7 @@ def compile_in_thread(
     """
     since, done = time.monotonic(), Future()
     watch(what)
-    lowered = program.lower(*args)  # in this thread, whose JAX settings hold
+    lowered = program.lower(*args)  # here: JAX's settings belong to a thread
 
     def compile_lowered():
         try:
@@ -280,9 +280,7 @@ def _requested(config: ResolvedConfig, options: RunOptions) -> int | None:
         return options.devices
     for name, value in (("devices", options.devices), ("num_processes", jax.process_count())):
         if value not in (None, 1):
-            raise invalid(
-                name, value, f"1 with {config.env}, whose envs are stepped in one process"
-            )
+            raise invalid(name, value, f"1 with {config.env}, which is stepped in one process")
     return 1
 
 

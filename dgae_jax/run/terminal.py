@@ -8,7 +8,6 @@ import contextlib
 import gc
 import io
 import os
-import shutil
 import sys
 import time
 from collections.abc import Callable, Iterator
@@ -84,11 +83,6 @@ def in_notebook() -> bool:
     ipython: Any = sys.modules.get("IPython")
     shell = ipython.get_ipython() if ipython else None
     return getattr(shell, "kernel", None) is not None and not _silent.get()
-
-
-def width() -> int:
-    """Return the number of columns of the terminal."""
-    return shutil.get_terminal_size().columns
 
 
 def write(stream: TextIO | None, text: str) -> None:

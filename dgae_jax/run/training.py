@@ -50,11 +50,11 @@ class RunError(RuntimeError):
 
 
 class DivergedError(RunError):
-    """A run whose updates or envs are no longer finite, because of its hyperparameters."""
+    """A run with updates or envs that are no longer finite, because of its hyperparameters."""
 
 
 class TaskFailedError(RunError):
-    """A run whose task raised an exception inside a program."""
+    """A task raised an exception inside a program."""
 
 
 class Finished(NamedTuple):
@@ -192,12 +192,12 @@ def _run_to_end(
             if options.resume:
                 directory.write_config(run_dir, config)
                 directory.extend_manifest(run_dir, options)
-            state = _iterate(config, options, logger, signals, state, on_eval)
+            state = _iterate(logger, signals, state, on_eval)
             if logger.metrics.skipped:
                 of = config.iterations * config.num_seeds
                 skipped = f"{logger.metrics.skipped:,} of {of:,} iterations"
                 terminal.warn(f"warning: in {skipped} a non-finite update was skipped")
-            result = _final_eval(config, options, logger, signals, state)
+            result = _final_eval(logger, signals, state)
         files.write_json(run_dir / "evaluation.json", result)
     return result
 
@@ -227,18 +227,14 @@ def _run_errors(config: ResolvedConfig, run_dir: Path, signals: Signals) -> Iter
 
 
 def _iterate(
-    config: ResolvedConfig,
-    options: RunOptions,
-    logger: RunLogger,
-    signals: Signals,
-    state: TrainState | None,
-    on_eval: EvalCallback | None,
+    logger: RunLogger, signals: Signals, state: TrainState | None, on_eval: EvalCallback | None
 ) -> TrainState:
     """Run the iterations that are left, until the budget is used or a signal came.
 
     Raises:
         DivergedError: too many iterations failed; the last finite state is saved.
     """
+    config, options = logger.config, logger.options
     samples, seeds = config.samples_per_iteration, config.num_seeds
     every = max(1, options.checkpoint_every // samples)
     done, count, seconds = logger.metrics.iteration, 1, 0.0
@@ -246,20 +242,20 @@ def _iterate(
     if state is not None:
         failures = np.asarray(runtime.gather(state.failures))
         if done == config.iterations:
-            _check_failures(failures, options, logger.run_dir)
+            _check_failures(failures, logger)
             return state
     mesh = make_mesh((options.devices or 1) * jax.process_count())
     trainer = make_trainer(make_task(config), CAPACITY, mesh)
     with Reporter(config.iterations * samples, seeds, logger.page) as reporter:
         resumed = state is not None
-        state = _compiled(config, trainer, state, signals, reporter)
+        state = _compiled(logger, trainer, state, signals, reporter)
         if resumed and done % every == 0:
             _periodic_eval(logger, state, signals, reporter, on_eval)  # if it stopped before
         stopping = signals.anywhere()
         while done < config.iterations and not stopping:
             count = min(count, config.iterations - done, every - done % every)
             since, warm = time.monotonic(), seconds > 0
-            state, measured = _dispatch(config, trainer, state, count, logger)
+            state, measured = _dispatch(logger, trainer, state, count)
             mean_return = logger.append(state, measured, count)
             history = _failures(failures, measured, count, samples)
             failures, broken = history[-1], history.max() >= options.max_nonfinite
@@ -273,7 +269,7 @@ def _iterate(
             if due or done == config.iterations or stopping or broken:
                 logger.save(state)
                 logger.draw()
-            _check_failures(history, options, logger.run_dir)
+            _check_failures(history, logger)
             if due and done < config.iterations:
                 _periodic_eval(logger, state, signals, reporter, on_eval)
                 stopping = signals.anywhere()  # all is saved
@@ -281,13 +277,14 @@ def _iterate(
 
 
 def _compiled(
-    config: ResolvedConfig,
+    logger: RunLogger,
     trainer: Trainer,
     state: TrainState | None,
     signals: Signals,
     reporter: Reporter,
 ) -> TrainState:
     """Compile the programs and return the state to begin with; a signal may end it at once."""
+    config = logger.config
     reporter.announce("compiling")
     with signals.may_stop(reporter.watch) as watch:
         if state is None:
@@ -298,11 +295,11 @@ def _compiled(
 
 
 def _dispatch(
-    config: ResolvedConfig, trainer: Trainer, state: TrainState, count: int, logger: RunLogger
+    logger: RunLogger, trainer: Trainer, state: TrainState, count: int
 ) -> tuple[TrainState, dict[str, Any]]:
     """Run the next iterations; out of memory, save the state before unless it was donated."""
     try:
-        state, measured = jax.block_until_ready(trainer.dispatch(config, state, count))
+        state, measured = jax.block_until_ready(trainer.dispatch(logger.config, state, count))
         return state, runtime.gather(measured)
     except (MemoryError, jax.errors.JaxRuntimeError) as reason:
         donated = any(x.is_deleted() for x in jax.tree.leaves(state))
@@ -327,13 +324,8 @@ def _periodic_eval(
             on_eval(logger.steps, result)
 
 
-def _final_eval(
-    config: ResolvedConfig,
-    options: RunOptions,
-    logger: RunLogger,
-    signals: Signals,
-    state: TrainState,
-) -> dict[str, Any]:
+def _final_eval(logger: RunLogger, signals: Signals, state: TrainState) -> dict[str, Any]:
+    config, options = logger.config, logger.options
     with Reporter(page=logger.page) as reporter, signals.may_stop(reporter.watch) as watch:
         episodes = counted(options.episodes, "episode")
         episodes += f" of each of {config.num_seeds} seeds" if config.num_seeds > 1 else ""
@@ -355,10 +347,10 @@ def _failures(before: np.ndarray, measured: dict[str, Any], count: int, samples:
     return np.stack(history[1:])
 
 
-def _check_failures(failures: np.ndarray, options: RunOptions, run_dir: Path) -> None:
-    if (most := int(failures.max())) >= options.max_nonfinite:
+def _check_failures(failures: np.ndarray, logger: RunLogger) -> None:
+    if (most := int(failures.max())) >= logger.options.max_nonfinite:
         why = f"non-finite updates, or most env steps masked, in {most} iterations in a row"
-        raise DivergedError(1, f"stopped: {why}; the last finite state is in {run_dir}")
+        raise DivergedError(1, f"stopped: {why}; the last finite state is in {logger.run_dir}")
 
 
 def _left(run_dir: Path) -> str:

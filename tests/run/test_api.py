@@ -83,7 +83,7 @@ def test_signal_raises_run_error_with_directory(tmp_path, monkeypatch):
     def interrupted(*args, **how):
         signal.raise_signal(signal.SIGTERM)
         honest(*args, **how)
-        pytest.fail("the evaluation went on")
+        pytest.fail("the evaluation continued")
 
     monkeypatch.setattr(logger, "evaluate_policies", interrupted)
     with pytest.raises(RunError, match="stopped by SIGTERM; continue with --resume ") as caught:

@@ -1,4 +1,4 @@
-"""What ends a run early, and how it continues."""
+"""Runs that end early, and continue."""
 
 import contextlib
 import dataclasses
@@ -48,7 +48,7 @@ def test_signal_breaks_off_evaluation(kind, code, evaluation, finished, tmp_path
         if len(calls) == evaluation:
             signal.raise_signal(kind)
             honest(*args, **how)
-            pytest.fail("the evaluation went on")
+            pytest.fail("the evaluation continued")
         return honest(*args, **how)
 
     with pytest.MonkeyPatch.context() as patch:

@@ -40,7 +40,7 @@ ACCOUNTS = (
 
 @pytest.fixture(autouse=True, scope="module")
 def _no_accounts(tmp_path_factory):
-    """Nobody is logged in anywhere, and nothing is sent."""
+    """Log out everywhere, so that nothing is sent."""
     home = tmp_path_factory.mktemp("home")
     with pytest.MonkeyPatch.context() as patch:
         for name in ACCOUNTS:
@@ -237,7 +237,7 @@ def test_wandb_stays_offline_without_login(logged):
 
 
 class Failing:
-    """A logger whose method or opening `at` breaks."""
+    """A logger that fails at its opening or in a method."""
 
     def __init__(self, calls, at):
         self.calls, self.at = calls, at
@@ -248,24 +248,21 @@ class Failing:
         if name == self.at:
             raise ConnectionError("the network is gone\nmore")
 
-    def rows(self, rows):
-        self.take("rows")
-
-    def evaluations(self, rows):
-        self.take("evaluations")
+    def log(self, entries):
+        self.take("log")
 
     def close(self, paths, finished):
         self.take("close")
 
 
-@pytest.mark.parametrize("at", ["open", "rows", "evaluations", "close"])
+@pytest.mark.parametrize("at", ["open", "log", "close"])
 def test_failing_logger_costs_one_warning(at, plain, tmp_path, capsys, monkeypatch):
     run_dir, calls = tmp_path / "run", []
     monkeypatch.setitem(loggers.LOGGERS, "tensorboard", lambda place: Failing(calls, at))
     assert train(run_dir, log=("tensorboard",)) == 0
     assert (calls.count(at), calls[-1]) == (1, at)
     why = "ConnectionError: the network is gone"
-    rest = "the training goes on, and --resume adds what is missing"
+    rest = "the run continues, and --resume adds what is missing"
     assert capsys.readouterr().err == f"warning: --log tensorboard stops here ({why}); {rest}\n"
     assert last(run_dir).read_bytes() == last(plain).read_bytes()
 
@@ -274,7 +271,7 @@ def test_failing_logger_costs_one_warning(at, plain, tmp_path, capsys, monkeypat
 def test_failed_logger_catches_up_after_resume(tmp_path, monkeypatch):
     run_dir = tmp_path / "run"
     with monkeypatch.context() as patch:
-        patch.setitem(loggers.LOGGERS, "tensorboard", lambda place: Failing([], "rows"))
+        patch.setitem(loggers.LOGGERS, "tensorboard", lambda place: Failing([], "log"))
         assert train(run_dir, log=("tensorboard",)) == 0
     assert not (run_dir / "tensorboard").exists()
     steps = 10 * SMALL.samples_per_iteration

@@ -1,4 +1,4 @@
-"""Devices, processes, signals: on one machine, which stands for several hosts."""
+"""Devices, processes, signals: two processes of one machine in place of several hosts."""
 
 import importlib
 import json

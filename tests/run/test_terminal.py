@@ -109,7 +109,7 @@ def read_all(master, shown):
     try:
         while True:
             shown.append(os.read(master, 1000))
-    except OSError:  # how Linux says that a terminal has nobody left
+    except OSError:  # the other end is closed
         return
 
 
@@ -133,7 +133,7 @@ def test_live_bar_survives_an_old_or_closed_terminal(hung_up, tmp_path):
         assert b"128 of 128 steps" in b"".join(shown)
 
 
-class Cell:
+class Output:
     """The output of a notebook cell, as IPython's `display` is told to make it."""
 
     def __init__(self):
@@ -147,7 +147,7 @@ class Cell:
 
 @pytest.fixture
 def cell(monkeypatch):
-    cell, ipython, display = Cell(), ModuleType("IPython"), ModuleType("IPython.display")
+    cell, ipython, display = Output(), ModuleType("IPython"), ModuleType("IPython.display")
     ipython.get_ipython = lambda: SimpleNamespace(kernel="a kernel")
     ipython.version_info = (9, 0)  # Matplotlib asks
     display.display = cell.display
