@@ -18,9 +18,9 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from numpy.testing import assert_allclose, assert_array_equal
 
 import dgae_jax as dg
+from dgae_jax.envs.gym_tasks import GYM_TASKS
 from dgae_jax.envs.registry import custom_env
 from dgae_jax.export import gl
-from tests.helpers import GYM_TASKS
 from tests.probes import Counter
 
 CLOSE = functools.partial(assert_allclose, rtol=1e-10, atol=1e-10)
