@@ -60,15 +60,6 @@ def look(algo: str, number: int = 0) -> Look:
     return Look(colour, *(("-", marker, colour) if distribution else ("--", marker, "white")))
 
 
-class Mark(NamedTuple):
-    """A row of a dot plot: a value with its interval, and single values."""
-
-    label: str
-    look: Look
-    estimate: Estimate
-    dots: np.ndarray = np.empty(0)
-
-
 def learning_curves(groups: Iterable[Group], published: Sequence[Published] = ()) -> Figure:
     """Draw the return during training per task: mean over seeds ± one standard deviation.
 
@@ -115,7 +106,8 @@ def final_returns(groups: Iterable[Group]) -> Figure:
     """Draw the interquartile mean of the final returns with its interval, and each seed."""
 
     def draw(axes: Axes, members: Sequence[Group]) -> None:
-        _dots(axes, [_mark(g, analysis.interquartile_mean(g.finals), g.finals) for g in members])
+        finals = [group.finals for group in members]
+        _dots(axes, members, [analysis.interquartile_mean(scores) for scores in finals], finals)
         axes.set_xlabel("return of the final policy")
 
     return _dot_panels(groups, draw)
@@ -126,8 +118,7 @@ def speed(groups: Iterable[Group]) -> Figure:
 
     def draw(axes: Axes, members: Sequence[Group]) -> None:
         rates = [np.array([row.samples_per_second for row in group.rows]) for group in members]
-        means = [Estimate(rate.mean(), None) for rate in rates]
-        _dots(axes, [_mark(*each) for each in zip(members, means, rates, strict=True)])
+        _dots(axes, members, [Estimate(rate.mean(), None) for rate in rates], rates)
         axes.set_xlabel("samples per second")
         axes.set_xlim(0, 1.1 * max(rate.max() for rate in rates))
         axes.xaxis.set_major_formatter(EngFormatter(sep=""))
@@ -140,7 +131,7 @@ def improvement(found: Sequence[Improvement]) -> Figure:
 
     def draw(axes: Axes, duels: Sequence[Improvement]) -> None:
         names = [f"{duel.better.name} > {duel.worse.name}\n{duel.task}" for duel in duels]
-        _dots(axes, [_mark(duel.better, duel.estimate) for duel in duels])
+        _dots(axes, [duel.better for duel in duels], [duel.estimate for duel in duels])
         axes.set_yticks(range(len(duels)), names)
         axes.axvline(0.5, color=FAINT, linewidth=1)
         axes.set(xlabel="probability of improvement", xlim=(-0.03, 1.03))
@@ -198,13 +189,16 @@ def pit_histograms(found: Mapping[str, tuple[str, dict[str, Any]]]) -> Figure:
     return figure
 
 
-def _mark(group: Group, estimate: Estimate, *dots: np.ndarray) -> Mark:
-    return Mark(group.name, look(group.algo, group.number), estimate, *dots)
-
-
-def _dots(axes: Axes, marks: Sequence[Mark]) -> None:
-    """Draw rows from top to bottom: ticks, the interval, the value."""
-    for y, (_, (colour, _, marker, fill), estimate, dots) in enumerate(marks):
+def _dots(
+    axes: Axes,
+    groups: Sequence[Group],
+    estimates: Sequence[Estimate],
+    seeds: Sequence[np.ndarray] | None = None,
+) -> None:
+    """Draw rows from top to bottom: ticks of the seeds, the interval, the value."""
+    seeds = seeds or [np.empty(0)] * len(groups)
+    for y, (group, estimate, dots) in enumerate(zip(groups, estimates, seeds, strict=True)):
+        colour, _, marker, fill = look(group.algo, group.number)
         faint = {"color": colour, "alpha": 0.6}
         axes.plot(dots, np.full(len(dots), y), "|", markersize=7, **faint)
         if estimate.interval is not None:
@@ -212,8 +206,8 @@ def _dots(axes: Axes, marks: Sequence[Mark]) -> None:
             axes.plot(estimate.interval, [y, y], "-", **style)
         style = {"color": colour, "markerfacecolor": fill, "markersize": 6, "zorder": 3}
         axes.plot(estimate.value, y, marker or "o", **style)
-    axes.set_yticks(range(len(marks)), [mark.label for mark in marks])
-    axes.set_ylim(len(marks) - 0.5, -0.5)
+    axes.set_yticks(range(len(groups)), [group.name for group in groups])
+    axes.set_ylim(len(groups) - 0.5, -0.5)
     axes.grid(axis="y", visible=False)
     axes.tick_params(axis="y", length=0)
 

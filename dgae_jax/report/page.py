@@ -5,9 +5,7 @@ import gc
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import NamedTuple, Self
 
-import numpy as np
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from matplotlib.figure import Figure
 
@@ -72,33 +70,24 @@ def page(sweeps: Sequence[Sweep], published: Sequence[Published] = ()) -> str:
         lstrip_blocks=True,
     )
     environment.filters |= {"counted": counted, "number": tables.number, "svg_uri": _svg_uri}
-    environment.globals |= {"figures": figures, "tables": tables, "settings": _settings}
-    environment.globals |= {"versions": _versions, "videos": _videos}
-    reports = [Content.of(sweep) for sweep in sweeps]
-    return environment.get_template("page.html").render(reports=reports, published=published)
+    template = environment.get_template("page.html")
+    return template.render(
+        sweeps=[(sweep, groups_of(sweep.rows)) for sweep in sweeps],
+        published=published,
+        analysis=analysis,
+        by_task=by_task,
+        figures=figures,
+        settings=_settings,
+        tables=tables,
+        versions=_versions,
+        videos=_videos,
+    )
 
 
-class Content(NamedTuple):
-    """A sweep with the comparisons that decide which sections it has."""
-
-    sweep: Sweep
-    groups: list[Group]
-    tasks: dict[str, list[Group]]
-    improvements: list[analysis.Improvement]
-    scores: dict[str, tuple[Group, list[np.ndarray]]]
-
-    @classmethod
-    def of(cls, sweep: Sweep) -> Self:
-        """Return the content for a sweep."""
-        groups = groups_of(sweep.rows)
-        found = analysis.improvements(groups)
-        return cls(sweep, groups, by_task(groups), found, analysis.normalised(groups))
-
-
-def _videos(sweep: Sweep, tasks: dict[str, list[Group]]) -> dict[str, str]:
+def _videos(sweep: Sweep, groups: Iterable[Group]) -> dict[str, str]:
     found = {}
-    for task, members in tasks.items():
-        names = (name.replace(":", "-") for name in (task, members[0].rows[0].env))
+    for task, env in {group.task: group.rows[0].env for group in groups}.items():
+        names = (name.replace(":", "-") for name in (task, env))
         paths = (sweep.directory / "videos" / f"{name}.mp4" for name in names)
         if path := next((path for path in paths if path.is_file()), None):
             found[task] = _data_uri("video/mp4", path.read_bytes())
