@@ -29,7 +29,7 @@ COLOURS = {"clip": "#0072B2", "trust-region": "#D55E00", "gradient": "#009E73"}
 CUSTOM, PUBLISHED, FAINT = "#56B4E9", "#CC79A7", "#777777"
 
 MARKERS = ("", "o", "s", "^", "D", "v", "P", "X")
-"""Markers of groups whose colour and line another group has."""
+"""Markers that tell apart groups of the same colour and line."""
 
 STYLE = Path(__file__).parent / "templates" / "figures.mplstyle"
 

@@ -12,7 +12,7 @@ ALGORITHMS = ("ppo", "dppo", "trpo", "dtrpo", "a2c", "da2c")
 HEIGHT = dict(zip(ALGORITHMS, (3000.0, 3300.0, 2400.0, 2700.0, 900.0, 1000.0), strict=True))
 
 
-def row(env="hopper", algo="dppo", seed=0, **changes):
+def row(env="hopper", algo="dppo", seed=0, run=None, **changes):
     """One row; `changes` replace what is in it."""
     config = json.loads(json.dumps(to_dict(resolve(preset("tuned", algo, env)))))
     generator = np.random.default_rng([seed, ALGORITHMS.index(algo), len(env)])
@@ -20,9 +20,8 @@ def row(env="hopper", algo="dppo", seed=0, **changes):
     steps = np.linspace(5_000, 999_424, 120).astype(int)
     curve = height * (1 - np.exp(-steps / 250_000)) + generator.normal(0, 60, len(steps))
     returns = generator.normal(height, 20, 20)
-    name = f"{env}-{algo}-{seed}"
     found = {
-        "cell": name,
+        "cell": run or f"{env}-{algo}-{seed}",
         "env": env,
         "env_version": config["env_version"],
         "algo": algo,
@@ -58,7 +57,7 @@ def plain(scores, env="hopper", algo="dppo", **changes):
 def study(directory, rows, planned=()):
     """Write the directory of a sweep with these rows; return its path."""
     directory.mkdir(parents=True, exist_ok=True)
-    runs = {each["cell"]: each["config"] for each in rows} | {name: {} for name in planned}
+    runs = {name: {} for name in [*(each["cell"] for each in rows), *planned]}
     (directory / "study.json").write_text(json.dumps({"schema": 1, "cells": runs}))
     (directory / "results.jsonl").write_text("".join(json.dumps(each) + "\n" for each in rows))
     return directory

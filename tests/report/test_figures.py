@@ -55,11 +55,8 @@ def test_complete_sweep_has_a_panel_per_task_six_lines_and_one_legend(grouped):
     names = [text.get_text() for text in legend.get_texts()]
     assert names == ["PPO", "DPPO", "TRPO", "DTRPO", "A2C", "DA2C"]
     for axes in figure.axes:
-        assert [line.get_label() for line in axes.lines] == names
-        for line in axes.lines:
-            style = look(line.get_label().lower())
-            assert to_hex(line.get_color()) == style.colour.lower()
-            assert line.get_linestyle() == style.line
+        drawn = [(to_hex(line.get_color()).upper(), line.get_linestyle()) for line in axes.lines]
+        assert drawn == [look(name.lower())[:2] for name in names]
 
 
 def test_published_results_are_marked_within_the_budget_of_their_task(grouped):
@@ -96,7 +93,7 @@ NO_CURVE = {"steps": [1, 2], "return": [None, None]}
 AWKWARD = {
     "noisy env without a version": [row() | {"env": "brax:ant", "env_version": None}],
     "missing runs": [row("ant", "ppo"), row("ant", "dppo"), row("hopper", "a2c")],
-    "no episode ended": [row(curve=NO_CURVE), row(curve={"steps": [], "return": []}, cell="b")],
+    "no episode ended": [row(curve=NO_CURVE), row(seed=1, curve={"steps": [], "return": []})],
     "negative returns": plain([-5, -3], curve={"steps": [1, 2], "return": [-9, -4]}),
 }
 

@@ -57,9 +57,8 @@ def test_row_that_is_still_being_written_is_not_read(tmp_path):
 def test_directory_that_is_no_sweep_is_refused(tmp_path):
     assert refusal(tmp_path / "none").startswith(f"{tmp_path}/none: must be")
     assert "with study.json and results.jsonl" in refusal(tmp_path)
-    (tmp_path / "study.json").write_text('{"cells": {}}')
-    assert "must have results" in refusal(tmp_path)
-    (tmp_path / "results.jsonl").write_text("")
+    assert "must have results" in refusal(study(tmp_path, []))
+    (tmp_path / "results.jsonl").unlink()
     assert "must have results" in refusal(tmp_path)
     study(tmp_path, [row()])
     (tmp_path / "study.json").write_text("[]")
