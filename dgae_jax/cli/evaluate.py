@@ -15,10 +15,10 @@ from dgae_jax.run.options import INTEGER_RANGES, RunOptions, engine_of
 
 @dataclass(frozen=True, kw_only=True)
 class Choice:
-    """Which policy of a run."""
+    """Choice of a policy among those of a run."""
 
     checkpoint: Literal["latest", "best"] = "latest"
-    """latest, or best: by the evaluations during training, whose episodes chose it."""
+    """latest, or best: by the evaluations during training; judge it with another --seed."""
     index: int = 0
     """Which of the seeds that were trained together, from 0."""
     seed: int = 0
@@ -27,7 +27,7 @@ class Choice:
     """Cache of compiled programs; none disables it [path]."""
 
     def config(self, source: Path) -> ResolvedConfig:
-        """Return the configuration of a run; raise ConfigError for a seed that there is not."""
+        """Return the configuration of a run; raise ConfigError for an unknown seed."""
         config = directory.config_of(source)
         parse.check(
             self, index=(0, config.num_seeds - 1, f"the seeds of {source}"), seed=parse.INT32
@@ -35,8 +35,8 @@ class Choice:
         return config
 
 
-@dataclass(frozen=True)
-class EvaluateArguments:
+@dataclass(frozen=True, kw_only=True)
+class EvaluateArguments(Choice):
     """Evaluate the deterministic policy of a run directory, or of a file.
 
     Examples:
@@ -50,25 +50,19 @@ class EvaluateArguments:
     engine: Literal["gymnasium", "native", "jax", "mjx", "mjx-warp"] | None = None
     """Evaluation env: gymnasium, or an engine as in --physics of the training; by default the
     first that the task has."""
-    checkpoint: Literal["latest", "best"] = "latest"
-    """latest, or best: by the evaluations during training, whose episodes chose it; use another
-    --seed to judge it."""
     episodes: int = 20
     """Episodes per trained seed [episodes]."""
-    seed: int = 0
-    """Seed of the initial states; no two seeds share any [1]."""
     out: Path | None = None
     """File to write; by default evaluation-ENGINE.json or evaluation-ENGINE-best.json in the run
     directory, or beside the policy's file with its name in front [path]."""
-    cache_dir: str = RunOptions.cache_dir
-    """Cache of compiled programs; none disables it [path]."""
+    index: tyro.conf.Suppress[int] = 0
 
 
 @parse.command(EvaluateArguments)
 def evaluate(args: EvaluateArguments) -> None:
     """Evaluate one run directory."""
-    parse.check(args, episodes=INTEGER_RANGES["episodes"], seed=parse.INT32)
-    config = directory.config_of(args.run_dir)
+    parse.check(args, episodes=INTEGER_RANGES["episodes"])
+    config = args.config(args.run_dir)
     from dgae_jax.run import evaluation
 
     engine = engine_of(config, args.engine)
@@ -143,7 +137,7 @@ def _check_calibrate(args: CalibrateArguments) -> tuple[list[ResolvedConfig], Pa
             raise ConfigError(f"{path}: must be a run with a value distribution, not {config.algo}")
     out = args.out or files.beside(args.run_dirs[0], "calibration.png")
     if out.suffix != ".png":
-        raise invalid("out", out, "a file whose name ends in .png")
+        raise invalid("out", out, "a file named *.png")
     for file in (out, out.with_suffix(".json")):
         parse.check_file(file)
     return configs, out
@@ -178,7 +172,7 @@ def refit(args: RefitArguments) -> None:
     parse.check_file(out)
     own = out.exists() and out.samefile(args.run_dir)
     if out.suffix != ".msgpack" or own or out.absolute().parent.name == "checkpoints":
-        allowed = "a file whose name ends in .msgpack, neither the policy's own nor a checkpoint"
+        allowed = "a file named *.msgpack, neither the policy itself nor a checkpoint"
         raise invalid("out", out, allowed)
     from dgae_jax.run import calibration, checkpoint
 

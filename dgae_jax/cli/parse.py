@@ -1,4 +1,4 @@
-"""What all commands share: flags by tyro, mistakes as one message and exit code 2.
+"""The frame of all commands: flags by tyro, mistakes as one message and exit code 2.
 
 Nothing here imports JAX, so that a mistake is refused in under a second.
 """
@@ -83,7 +83,7 @@ PREFIXES: dict[Any, str] = {
 """Dataclasses that have aliases, and what stands before their fields in `ALIASES`."""
 
 _LISTED = object()
-"""Marks a dataclass whose fields are being listed by tyro's own rule."""
+"""Mark of a dataclass that tyro's own rule is listing."""
 
 registry = constructors.ConstructorRegistry()
 

@@ -31,7 +31,7 @@ class RenderArguments(Choice):
     run_dir: tyro.conf.Positional[Path]
     """Directory of the run, or the file of dgae refit [path]."""
     compare: tuple[Path, ...] = ()
-    """Further runs from the same initial states, shown beside it, from four on in a square
+    """Further runs from the same initial states, next to each other, in a square from four on
     [paths]."""
     during: bool = False
     """Show the policy at each checkpoint that the run keeps, one after the other."""
@@ -48,7 +48,7 @@ class RenderArguments(Choice):
     fps: int = 25
     """Frames per second of the MP4; a GIF has at most half of the default [1/s]."""
     out: Path | None = None
-    """File to write, to whose name .mp4 and .gif are added; by default video in the run directory,
+    """File to write, without .mp4 and .gif; by default video in the run directory,
     video-best, video-during or video-compare [path]."""
 
     @property
