@@ -184,9 +184,7 @@ def pit_histograms(found: Mapping[str, tuple[str, dict[str, Any]]]) -> Figure:
         axes.yaxis.set_major_formatter(PercentFormatter(1, decimals=0))
 
     titled = {f"{name}\n{coverage(critic[1])}": critic for name, critic in found.items()}
-    figure = _panels(titled, draw, PANEL[1], columns=3, sharey=True)
-    figure.axes[0].legend()
-    return figure
+    return _panels(titled, draw, PANEL[1], columns=3, sharey=True, legend=True)
 
 
 def _dots(

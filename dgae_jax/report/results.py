@@ -23,7 +23,6 @@ class Row:
     """One trained seed."""
 
     run: str
-    """Name of the run in its sweep."""
     env: str
     env_version: str | None
     algo: str
@@ -32,9 +31,8 @@ class Row:
     seed: int
     total_steps: int
     engine: str
-    """Simulator of the final evaluation."""
     final: float
-    """Mean return of the final policy."""
+    """Mean return of the final policy in `engine`."""
     returns: np.ndarray
     """Returns [E] of the final policy's episodes."""
     best: float | None

@@ -52,11 +52,6 @@ def test_improvement_counts_ties_half_and_agrees_with_scipy():
     assert found.interval[0] < won < found.interval[1]
 
 
-def test_single_seed_has_no_interval():
-    assert analysis.interquartile_mean(np.array([1.0])) == (1.0, None)
-    assert analysis.improvement([np.array([1.0, 2.0])], [np.array([1.0])]).interval is None
-
-
 def test_profile_is_the_share_of_seeds_above_each_score():
     strata = [np.array([0.1, 0.5]), np.array([0.9])]
     shares = analysis.performance_profile(strata, np.array([0.0, 0.1, 0.5, 0.95]))

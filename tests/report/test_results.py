@@ -113,6 +113,5 @@ def test_run_whose_return_is_not_finite_is_left_out_with_a_warning(tmp_path, cap
 def test_published_results_cover_every_task():
     rows = results.published()
     assert {one.task for one in rows} == set(TASKS)
-    trpo = ("walker2d", 1_000_000, "TRPO", 4502.0, 234.0, 3, "SB3-contrib, v3")
-    assert results.Published(*trpo) in rows
+    assert ("walker2d", 1_000_000, "TRPO", 4502.0, 234.0, 3, "SB3-contrib, v3") in rows
     assert ("swimmer", 4_000_000, "PPO", 282.0, None, None, "SLM-Lab") in rows

@@ -112,7 +112,6 @@ MARKERS = "with each table between <!-- dgae report: NAME --> and <!-- /dgae rep
     [
         ("nothing", MARKERS),
         ("\xff", "not text in UTF-8"),
-        ("<!-- dgae report: returns -->\n", MARKERS),
         ("<!-- dgae report: returns -->\n" + block("speed"), MARKERS),
         ("<!-- /dgae report -->\n" + block("speed"), MARKERS),
         (block("x"), "risk, reach, speed, not x"),
