@@ -1,7 +1,6 @@
 """Launchers of a sweep."""
 
 import os
-import socket
 
 import pytest
 
@@ -25,15 +24,6 @@ from dgae_jax.study.launch import LaunchOptions, launcher, slurm_parameters
 def test_an_invalid_option_is_refused_before_anything_starts(options, message):
     with pytest.raises(ConfigError, match=message):
         launcher(LaunchOptions(**options))
-
-
-def test_a_ray_cluster_that_does_not_answer_is_refused():
-    pytest.importorskip("ray")
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        address = f"127.0.0.1:{free.getsockname()[1]}"
-    with pytest.raises(ConfigError, match=f"address {address}: must be where a Ray cluster"):
-        launcher(LaunchOptions(launcher="ray", address=address))
 
 
 def test_slurm_is_refused_where_there_is_none(monkeypatch):
