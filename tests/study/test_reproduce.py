@@ -194,8 +194,8 @@ def test_a_run_whose_ray_node_dies_continues_on_another(longer, tmp_path):
 def test_submitit_runs_a_sweep(longer, tmp_path):
     pytest.importorskip("submitit")
     program = (
-        "from dgae_jax.study import launch; from dgae_jax.cli.reproduce import main\n"
-        "launch.SLURM_EXECUTOR = 'local'; raise SystemExit(main())"
+        "from dgae_jax.study import launch; from dgae_jax.cli.reproduce import reproduce\n"
+        "launch.SLURM_EXECUTOR = 'local'; raise SystemExit(reproduce())"
     )
     process = studies.start(tmp_path, "--launcher", "slurm", steps=800, program=("-c", program))
     code, lines, errors = studies.finish(process)
