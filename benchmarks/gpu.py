@@ -79,7 +79,7 @@ def engine(task: str, name: str, num_envs: int, arguments: Arguments) -> dict[st
 def training(algo: str, num_envs: int, seeds: int, arguments: Arguments) -> dict[str, Any]:
     """Return samples per second of all seeds, seconds to compile, and the peak of memory."""
     config = resolve(
-        dg.Config(
+        dg.Config().replace(
             env=arguments.tasks[0],
             algo=algo,
             num_envs=num_envs,

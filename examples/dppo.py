@@ -87,22 +87,22 @@ class Critic(nn.Module):
 
 
 class Statistics(NamedTuple):
-    count: jax.Array
+    n: jax.Array
     mean: jax.Array
     squares: jax.Array  # sum of squared deviations from the mean
 
     @property
     def std(self) -> jax.Array:
-        std = jnp.sqrt(self.squares / jnp.maximum(self.count, 1))
-        return jnp.where(self.count > 0, jnp.maximum(std, 1e-6), 1.0)
+        std = jnp.sqrt(self.squares / jnp.maximum(self.n, 1))
+        return jnp.where(self.n > 0, jnp.maximum(std, 1e-6), 1.0)
 
 
 def update_statistics(old: Statistics, samples: jax.Array) -> Statistics:
     """Add samples [T, N, …] by Welford's method."""
-    count = old.count + samples.shape[0] * samples.shape[1]
+    n = old.n + samples.shape[0] * samples.shape[1]
     deviation = samples - old.mean
-    mean = old.mean + deviation.sum((0, 1)) / count
-    return Statistics(count, mean, old.squares + (deviation * (samples - mean)).sum((0, 1)))
+    mean = old.mean + deviation.sum((0, 1)) / n
+    return Statistics(n, mean, old.squares + (deviation * (samples - mean)).sum((0, 1)))
 
 
 def normalize(statistics: Statistics, obs: jax.Array) -> jax.Array:
@@ -129,10 +129,10 @@ class State(NamedTuple):
 def make_train(config: Config):
     """Return `init(key) -> state` and `train_step(state) -> (state, mean episode return)`."""
     env: Any = dgae_jax.make_env("hopper", physics=config.physics)
-    policy = Policy(config.hidden, env.action_size, config.initial_std)
-    critic = Critic(config.hidden, config.quantiles)
+    policy: Any = Policy(config.hidden, env.action_size, config.initial_std)
+    critic: Any = Critic(config.hidden, config.quantiles)
     size = config.num_envs * config.num_steps
-    gradient_steps = config.total_steps / size * config.epochs * config.minibatches
+    gradient_steps = config.total_steps * config.epochs * config.minibatches // size
     optimizer = optax.chain(
         optax.clip_by_global_norm(config.max_grad_norm),
         optax.adam(optax.linear_schedule(config.learning_rate, 0.0, gradient_steps), eps=1e-5),

@@ -40,14 +40,8 @@ CRITICS: dict[str, Defaults] = {
     "ordered": {"quantiles": 64, "kappa": 1e-4},
 }
 
-TARGETS: dict[str, Defaults] = {
-    "bellman": {},
-    "bellman-frozen": {},
-    "lambda-shift": {},
-    "sr-lambda": {},
-    "lambda-return": {},
-    "monte-carlo": {},
-}
+_TARGETS = "bellman", "bellman-frozen", "lambda-shift", "sr-lambda", "lambda-return", "monte-carlo"
+TARGETS: dict[str, Defaults] = {name: {} for name in _TARGETS}
 RESIDUALS: dict[str, Defaults] = {"td": {}, "distributional": {}}
 COVARIANCES: dict[str, Defaults] = {"shared": {}, "state": {}}
 OPTIMIZERS: dict[str, Defaults] = {"adam": {}, "rmsprop": {}}

@@ -1,4 +1,4 @@
-"""From names to parts: registered parts, refusals, and which settings are leaves of a program."""
+"""Registered parts, refusals, and the settings that are leaves of a program."""
 
 from functools import partial
 
@@ -10,14 +10,13 @@ import pytest
 from numpy.testing import assert_allclose
 
 import dgae_jax as dg
-from dgae_jax.configs.algorithms import ALGORITHMS, Row
 from dgae_jax.configs.parts import CRITICS, SGD
 from dgae_jax.learn import build
 from dgae_jax.learn.critics import Target, distributional_td_error, quantile_critic
 from dgae_jax.learn.networks import SharedCovariance
 from dgae_jax.learn.updates import minibatch_update, surrogate
 from tests import probes
-from tests.helpers import SMALL, distance, small
+from tests.helpers import small
 
 
 @pytest.fixture
@@ -100,15 +99,6 @@ def test_registered_parts_of_every_kind_are_chosen_by_name_and_used(tables):
     assert jnp.isfinite(metrics["critic/loss"])
     moved = after.policy.params["params"]["log_std"] - before.policy.params["params"]["log_std"]
     assert_allclose(jnp.abs(moved), 0.01, rtol=1e-3)  # a step of Lion is one learning rate long
-
-
-def test_a_seventh_row_joins_the_table_and_trains(tables, monkeypatch):
-    dg.register("update", "kl-penalty", kl_penalty, SGD)
-    row = Row("quantile", "distributional", "lambda-shift", "kl-penalty")
-    monkeypatch.setitem(ALGORITHMS, "mine", row)
-    before, after, metrics = iterate(SMALL.replace(algo="mine"))
-    assert jnp.isfinite(metrics["policy/loss"])
-    assert distance(before.policy.params, after.policy.params) > 0
 
 
 def test_the_python_api_refuses_an_invalid_configuration(tmp_path):

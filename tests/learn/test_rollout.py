@@ -72,14 +72,6 @@ def test_episode_returns_are_undiscounted_and_nan_before_the_first_end(key):
     assert_array_equal(episodes.steps, 2)
 
 
-def test_episodes_continue_from_one_rollout_to_the_next(key):
-    episodes, first = run(Counter(), key, num_steps=7)
-    keys = jax.random.split(key, (5, 4))
-    _, second = rollout(Counter(), act, episodes, keys, episode_length=5)
-    reward = jnp.concatenate([first.reward, second.reward])[:, 0]
-    assert_array_equal(reward, [1, 2, 3, 4, 5] * 2 + [1, 2])
-
-
 def test_actions_are_clipped_before_they_act_and_recorded_as_sampled():
     episodes, step = counter()
     assert_array_equal(step.action, 3.0)
@@ -115,16 +107,6 @@ def test_a_non_finite_action_is_masked_too(key):
     assert 0 < int(episodes.nonfinite.sum()) == int(step.terminated[2].sum()) < 16
     assert all_finite(step)
     assert_array_equal(jnp.isnan(episodes.incident[1][:, 0]), episodes.nonfinite > 0)
-
-
-def test_a_state_that_is_non_finite_at_the_start_is_masked(key):
-    episodes = start(Counter(), jax.random.split(key, 4))
-    broken = episodes._replace(env=episodes.env.replace(obs=episodes.env.obs.at[1].set(jnp.nan)))
-    keys = jax.random.split(key, (3, 4))
-    episodes, step = rollout(Counter(), act, broken, keys, episode_length=100)
-    assert all_finite(step)
-    assert_array_equal(step.terminated[0], [False, True, False, False])
-    assert int(episodes.nonfinite.sum()) == 1
 
 
 def test_an_env_depends_on_its_own_keys_alone(key):

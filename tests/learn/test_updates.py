@@ -105,14 +105,6 @@ def fitted(loss, optimizer, params, batch, epochs, minibatches):
     return update.step(jax.random.key(0), TrainableState(params, update.init(params)), batch)
 
 
-def test_one_epoch_of_one_minibatch_is_one_optimizer_step(batch):
-    optimizer, loss = optax.adam(1e-2), surrogate(POLICY, 0.2)
-    state, _ = fitted(loss, optimizer, PARAMS, batch, 1, 1)
-    slopes = gradient(loss, PARAMS, batch)
-    updates, _ = optimizer.update(slopes, optimizer.init(PARAMS), PARAMS)
-    assert distance(state.params, optax.apply_updates(PARAMS, updates)) < 1e-6
-
-
 @pytest.mark.parametrize(("epochs", "minibatches"), [(1, 4), (3, 8)])
 def test_an_epoch_visits_every_sample_once(epochs, minibatches, batch):
     def loss(params, batch):  # each sample's gradient is 1
