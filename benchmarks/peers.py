@@ -1,5 +1,7 @@
 """Training steps per second of stable-baselines3 and sb3-contrib, in several layouts."""
 
+# pyright: reportMissingImports=false
+
 import itertools
 import time
 from collections.abc import Iterator
@@ -52,10 +54,10 @@ def steps_per_second(
     seconds: float,
 ) -> float:
     """Time as many iterations as fit, without the first."""
-    import torch  # pyright: ignore[reportMissingImports]
-    from stable_baselines3.common.callbacks import BaseCallback  # pyright: ignore[reportMissingImports]
-    from stable_baselines3.common.env_util import make_vec_env  # pyright: ignore[reportMissingImports]
-    from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecNormalize  # pyright: ignore[reportMissingImports]
+    import torch
+    from stable_baselines3.common.callbacks import BaseCallback
+    from stable_baselines3.common.env_util import make_vec_env
+    from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecNormalize
 
     ends: list[float] = []
 
@@ -81,8 +83,8 @@ def steps_per_second(
 
 def _model(algo: str, env: Any, width: int, steps: int) -> Any:
     """The library's algorithm with our samples per iteration, minibatches and epochs."""
-    from sb3_contrib import TRPO  # pyright: ignore[reportMissingImports]
-    from stable_baselines3 import A2C, PPO  # pyright: ignore[reportMissingImports]
+    from sb3_contrib import TRPO
+    from stable_baselines3 import A2C, PPO
 
     common = {
         "n_steps": steps,

@@ -178,7 +178,8 @@ def of_update(algo: str) -> list[list[int]]:
     env = dg.make_env("hopper", physics="jax")
     algorithm = dg.make_algorithm(algo, env, config)
     size, key = config.samples_per_iteration, jax.random.key(0)
-    obs, next_obs = jax.random.normal(key, (2, size, int(env.observation_size)))  # pyright: ignore[reportArgumentType]
+    obs_size = int(env.observation_size)  # pyright: ignore[reportArgumentType]
+    obs, next_obs = jax.random.normal(key, (2, size, obs_size))
     action, row = jax.random.normal(key, (size, env.action_size)), jax.random.normal(key, (size,))
     quantiles = algorithm.critic.predict(algorithm.critic.init(key), obs)
     log_prob = jnp.zeros(size) - env.action_size

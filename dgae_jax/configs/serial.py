@@ -107,11 +107,9 @@ def _built(cls: type, data: Any, prefix: str) -> Any:
     kinds = get_type_hints(cls)
     for name in sorted(set(data) ^ set(kinds)):
         raise ConfigError(f"{prefix}{name}: {'unknown' if name in data else 'missing'}")
-    return cls(
-        **{
-            name: _built(kind, data[name], f"{prefix}{name}.")  # pyright: ignore[reportArgumentType]
-            if dataclasses.is_dataclass(kind)
-            else data[name]
-            for name, kind in kinds.items()
-        }
-    )
+    values = {}
+    for name, kind in kinds.items():
+        nested = dataclasses.is_dataclass(kind)
+        value, inner = data[name], f"{prefix}{name}."
+        values[name] = _built(kind, value, inner) if nested else value  # pyright: ignore
+    return cls(**values)

@@ -22,8 +22,8 @@ def critic_diagnostics(
     """Compare a critic with Monte-Carlo returns.
 
     These are discounted sums to the end of the episode, or to the end of the rollout and the value
-    there. `similar_means` is the share of steps whose target and prediction have similar means and
-    different shapes, |d(r + γG′, G)| ≤ 0.1 W₁(r + γG′, G) (Sec. results).
+    there. `similar_means` is the share of steps with similar means and different shapes of target
+    and prediction, |d(r + γG′, G)| ≤ 0.1 W₁(r + γG′, G) (Sec. results).
 
     Args:
         reward: scaled rewards.

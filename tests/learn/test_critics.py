@@ -1,6 +1,6 @@
 """Critics: their losses and targets, where each target leads, and their calibration.
 
-The fixed points are those of a process whose return distribution is known. From `FIRST` a fair coin
+The fixed points are those of a process with a known return distribution. From `FIRST` a fair coin
 pays ±1 and leads to `SECOND`, where another pays ±1 and leads to the end. With γ = ½ the return
 from `FIRST` is ±1 ± ½, each with probability ¼, and from `SECOND` ±1.
 """

@@ -29,7 +29,7 @@ def test_weights_are_non_negative_and_of_mean_one(spec, k):
 
 def test_cvar_of_a_quarter_weighs_the_lowest_quarter_by_four():
     assert_allclose(weights_of("cvar:0.25", 8), [4, 4, 0, 0, 0, 0, 0, 0], atol=1e-6)
-    # a cell is cut in proportion
+    # α cuts the second weight in proportion
     assert_allclose(weights_of("cvar:0.3", 4), [1 / 0.3, 4 * 0.05 / 0.3, 0, 0], rtol=1e-5)
 
 
