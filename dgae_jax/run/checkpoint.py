@@ -1,4 +1,4 @@
-"""Checkpoints: one file of plain data each, whose loading runs no code.
+"""Checkpoints: files of plain data; loading one runs no code.
 
 A file is a line of JSON with schema and SHA-256, then msgpack with the arrays by name and the
 configuration.
@@ -56,7 +56,7 @@ class CheckpointError(ConfigError):
 
 
 class DamagedError(CheckpointError):
-    """A checkpoint whose bytes are not what was written; an older one may be whole."""
+    """A checkpoint with other bytes than were written; an older one may be whole."""
 
 
 class MissingError(CheckpointError):
@@ -97,7 +97,7 @@ def save(
         steps: samples of each run so far. Files of more steps do not count: the run went back
             behind them because they were damaged.
         keep: how many of the latest files stay.
-        best: steps of the best evaluation, whose file stays too.
+        best: steps of the best evaluation; its file stays too.
 
     Raises:
         NotFiniteError: a number is not finite; nothing is written.
@@ -199,7 +199,7 @@ def load(path: Path, like: T, *, part: bool = False) -> T:
 
 
 def _read(path: Path) -> tuple[int, dict[str, Any], str]:
-    """Return schema, packed arrays and configuration of a file whose checksum is right."""
+    """Check the checksum and return schema, packed arrays and configuration."""
     try:
         data = path.read_bytes()
     except OSError as reason:
@@ -238,7 +238,7 @@ def _current_name(name: str, schema: int) -> str:
 
 
 def _array(path: Path, name: str, packed: Any, like: Any) -> np.ndarray:
-    """Decode an array, whose type and shape are compared before its bytes become numbers."""
+    """Decode an array; its type and shape are compared before its bytes become numbers."""
     with _decoding(path):
         if packed.code != ARRAY:
             raise ValueError
@@ -381,7 +381,7 @@ def _load_networks(path: Path, config: ResolvedConfig) -> Networks:
 
 
 def _check_run(path: Path, config: ResolvedConfig) -> None:
-    """Refuse a checkpoint of another run, whose arrays may have the same shapes."""
+    """Refuse a checkpoint of another run; its arrays may have the same shapes."""
     for name, (ours, theirs) in differences(config, config_of(path)).items():
         if name not in MAY_CHANGE:
             raise CheckpointError(f"{path}: is of another run, its {name} is {theirs}, here {ours}")

@@ -28,7 +28,7 @@ VERSIONED = (
     "dgae_jax", "jax", "jaxlib", "flax", "optax", "brax", "mujoco", "mujoco-mjx", "playground",
     "gymnasium", "numpy",
 )  # fmt: skip
-"""Packages whose versions are recorded."""
+"""Packages to record the versions of."""
 
 OWN_DIRECTORIES = ("checkpoints", "nonfinite", "tensorboard", "wandb", "mlflow")
 OWN_FILES = ("config.json", "manifest.json", "metrics.jsonl", "evaluations.jsonl", "sinks.json")

@@ -27,7 +27,7 @@ from dgae_jax.run.metrics import EvaluationsFile
 ITERATIONS = 256
 """Most iterations that are read at once."""
 
-MEDIA = ("curve.png", "video.mp4", "video.gif", "film.mp4", "film.gif")
+MEDIA = ("curve.png", "video.mp4", "video.gif")
 """Files of the run directory that loggers get at the end."""
 
 CONNECT_SECONDS = 3.0

@@ -76,7 +76,7 @@ def test_gymnasium_task_is_learnt():
 
 
 @pytest.mark.slow
-def test_gymnasium_run_is_reproducible_and_resumes_in_new_episodes(tmp_path, capsys):
+def test_gymnasium_run_repeats_and_resumes_in_new_episodes(tmp_path, capsys):
     config = resolve(PENDULUM.replace(num_seeds=2, total_steps=64, episode_length=1000))
     rows = [dg.train(config, tmp_path / name, **CHOSEN).metrics for name in "ab"]
     assert [{**row, "seconds": 0} for row in rows[0]] == [{**row, "seconds": 0} for row in rows[1]]

@@ -182,7 +182,7 @@ print(step)
 """
 
 
-def test_process_killed_anywhere_leaves_a_directory_that_can_start_or_resume(tmp_path):
+def test_killed_creation_can_start_or_resume(tmp_path):
     argv = [sys.executable, "-W", "ignore", "-c", KILLED_ANYWHERE, tmp_path]
     done = subprocess.run(argv, cwd=ROOT, capture_output=True, text=True)
     assert done.stderr == ""
