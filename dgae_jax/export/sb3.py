@@ -27,10 +27,11 @@ class Sb3VecEnv(VecEnv):
 
     def reset(self) -> np.ndarray:
         """Begin an episode in every env, with the seeds of `seed` if it was called."""
-        seeds, options = self._seeds, self._options[0]
+        seeds: Any = self._seeds
+        options = self._options[0]
         self._reset_seeds()
         self._reset_options()
-        obs, infos = self.env.reset(seed=seeds, options=options)  # pyright: ignore[reportArgumentType]
+        obs, infos = self.env.reset(seed=seeds, options=options)
         self.reset_infos = _per_env(infos, self.num_envs)
         return obs
 

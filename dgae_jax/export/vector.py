@@ -120,8 +120,8 @@ class VectorTask(VectorEnv):
         self._states: EnvStates | None = None
         self._seeds: list[int | None] = [None] * num_envs
 
-    @property
-    def np_random_seed(self) -> tuple[int | None, ...]:  # pyright: ignore[reportIncompatibleMethodOverride] as SyncVectorEnv's
+    @property  # a tuple, as SyncVectorEnv's
+    def np_random_seed(self) -> Any:
         """The last seed of each env; None before its first reset."""
         return tuple(self._seeds)
 

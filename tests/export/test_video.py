@@ -140,7 +140,7 @@ def read_video(path):
 
 
 def length(path):
-    """Of a GIF, which may join frames that stand still [ms]."""
+    """Return the duration of a GIF [ms]."""
     with Image.open(path) as gif:
         return sum(frame.info["duration"] for frame in ImageSequence.Iterator(gif))
 
