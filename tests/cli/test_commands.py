@@ -28,15 +28,11 @@ def test_training_writes_a_run_directory(trained):
     assert errors == ""
 
 
-def test_the_budget_is_never_exceeded(trained):
+def test_the_budget_is_never_exceeded_and_the_last_line_is_the_return(trained):
     run_dir, lines, _ = trained
     assert lines[0].endswith("15 iterations × 64 samples = 960 of 1,000 steps")
     rows = metrics.read(run_dir / "metrics.jsonl")
     assert [row["steps"] for row in rows] == list(range(64, 961, 64))
-
-
-def test_the_last_line_is_the_return_and_the_directory(trained):
-    run_dir, lines, _ = trained
     result = json.loads((run_dir / "evaluation.json").read_text())
     assert (result["engine"], len(result["returns"])) == ("gymnasium", 3)
     assert f"return {result['return_mean']:,.1f} ± {result['return_std']:,.1f}" in lines[-1]

@@ -33,15 +33,11 @@ def test_flags_start_from_the_preset_of_task_and_algorithm():
 @pytest.mark.parametrize(
     ("words", "setting", "value"),
     [
-        ("--total-steps 1e6", "total_steps", 1_000_000),
         ("--total_timesteps=2.5E5", "total_steps", 250_000),
-        ("--num-timesteps 1_000_000", "total_steps", 1_000_000),
         ("--n_envs 32", "num_envs", 32),
-        ("--unroll-length 64", "num_steps", 64),
         ("--horizon 64", "num_steps", 64),
         ("--lam 0.5", "gae_lambda", 0.5),
         ("--discounting 0.5", "gamma", 0.5),
-        ("--clip_coef 0.3", "policy.options", {"clip_eps": 0.3}),
         ("--policy.clip 0.3", "policy.options", {"clip_eps": 0.3}),
         ("--algo trpo --target-kl 0.02", "policy.options", {"max_kl": 0.02}),
         ("--algo trpo --policy.backtracks 3", "policy.options", {"max_backtracks": 3}),
@@ -51,7 +47,6 @@ def test_flags_start_from_the_preset_of_task_and_algorithm():
         ("--algo trpo --update-epochs 3", "critic.fit", {"epochs": 3}),
         ("--hidden-sizes 8 16", "policy.hidden", (8, 16)),
         ("--env Walker2d", "env", "walker2d"),
-        ("--algorithm A2C", "algo", "a2c"),
     ],
 )
 def test_names_and_numbers_of_other_trainers_are_understood(words, setting, value):
@@ -62,10 +57,9 @@ def test_names_and_numbers_of_other_trainers_are_understood(words, setting, valu
         assert found == value
 
 
-def test_documented_names_of_other_trainers_are_flags():
-    known = {alias[2:] for aliases in parse.ALIASES.values() for alias in aliases.split()}
-    assert {"total-timesteps", "num-timesteps", "n-envs", "n-steps", "clip-range"} <= known
-    assert len(known) == sum(len(aliases.split()) for aliases in parse.ALIASES.values())
+def test_no_alias_means_two_settings():
+    aliases = " ".join(parse.ALIASES.values()).split()
+    assert len(set(aliases)) == len(aliases)
 
 
 @pytest.mark.parametrize(
@@ -73,14 +67,11 @@ def test_documented_names_of_other_trainers_are_flags():
     [
         ("train --env hoper", "error: --env hoper: must be one of ant, hopper, swimmer, walker2d"),
         ("train --policy.minibatches 7", "--policy.minibatches 7: must be a divisor of"),
-        ("train --episodes 0", "--episodes 0: must be a whole number from 1 to 10,000"),
-        ("train --gamma nan", "--gamma nan: must be a number from 0 to 1"),
         ("train --inexact", "--inexact True: must be left out without --resume"),
         ("train --algo trpo --clip-eps 0.3", "--policy.clip-eps 0.3: must be unset"),
         ("train --env Hopper-v4 --env-version v5", "--env-version v5: must be v4"),
         ("train --log visdom", "--log visdom: must be one or more of tensorboard, wandb, mlflow"),
         ("train --run-dir /dev/null/x", "--run-dir /dev/null/x: must be a directory that can be"),
-        ("train --resume nowhere", "nowhere: must be a run directory"),
         ("train --num-envs many", "many: must be a whole number"),
         ("train --seed 1e400", "1e400: must be a whole number"),
         ("train --algo pop", "invalid choice 'pop'"),
@@ -89,7 +80,6 @@ def test_documented_names_of_other_trainers_are_flags():
         ("train hopper", "Unrecognized options: hopper"),
         ("train --tyro-print-completion csh", "error: Shell should be one"),
         ("evaluate", "RUN-DIR Directory of the run"),
-        ("evaluate . --engine ode", "invalid choice 'ode'"),
         ("evaluate nowhere", "nowhere: must be a run directory; there is nothing of that name"),
         ("calibrate", "error: RUN_DIRS: must be one run directory or more"),
         ("refit . --num-envs 0", "--num-envs 0: must be a whole number from 1 to 10,000"),
@@ -123,9 +113,7 @@ def test_mistakes_are_refused_with_the_flag_and_what_is_allowed(
     ("argv", "message"),
     [
         ("--resume RUN --preset paper", "--preset paper: must be left out: all settings start"),
-        ("--resume RUN --config FILE", "--config FILE: must be left out: all settings start"),
         ("--config FILE --algo ppo", "--algo ppo: must be dppo as in FILE, or left out"),
-        ("--config FILE --preset paper", "--preset paper: must be left out: all settings start"),
         ("--resume RUN --run-dir x", "--run-dir x: must be left out: --resume writes to RUN"),
         ("--resume RUN --gamma 0.5", "--gamma 0.5: must be 0.995 as in RUN, or left out"),
         ("--run-dir RUN", "--run-dir RUN: must be a new or empty directory"),
@@ -239,11 +227,3 @@ def test_a_terminal_has_colours_where_it_can_and_may(environment, colours):
     subprocess.run(program, cwd=ROOT, stdout=theirs, env=variables | environment, check=True)
     os.close(theirs)
     assert (b"\x1b[" in os.read(ours, 100_000)) == colours
-
-
-def test_help_is_ascii_where_the_terminal_is():
-    program = [sys.executable, "-m", "dgae_jax", "figures", "--help"]
-    environment = {**os.environ, "PYTHONIOENCODING": "ascii", "COLUMNS": "80"}
-    done = subprocess.run(program, cwd=ROOT, capture_output=True, env=environment, check=True)
-    assert done.stdout.isascii()
-    assert b"\\u" not in done.stdout

@@ -31,9 +31,7 @@ PLAIN = st.recursive(
 CONFIG = to_dict(dg.Config())
 FLAGS = ["--" + name.replace("_", "-") for name in CONFIG]
 FLAGS += [f"--{part}.{name}" for part in ("policy", "critic", "noise") for name in CONFIG[part]]
-FLAGS += [
-    f"--{name}" for name in ("preset", "config", "run-dir", "resume", "inexact", "lr")
-]
+FLAGS += [f"--{name}" for name in ("preset", "config", "run-dir", "resume", "inexact", "lr")]
 VALUES = ["--", "-h2", "DTRPO", "Ant-v5", "brax:", "cvar:0.1", "nan", "-1", "1e400", "True", "None"]
 WORDS = st.sampled_from(FLAGS + VALUES) | st.text(max_size=10)
 
