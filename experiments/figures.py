@@ -1,4 +1,4 @@
-"""Draw the figures of the paper that need no training: python experiments/figures.py --out figures"""
+"""Draw the figures of the paper that need no training: python experiments/figures.py"""
 
 import sys
 
