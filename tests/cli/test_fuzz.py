@@ -36,7 +36,7 @@ VALUES = ["--", "-h2", "DTRPO", "Ant-v5", "brax:", "cvar:0.1", "nan", "-1", "1e4
 WORDS = st.sampled_from(FLAGS + VALUES) | st.text(max_size=10)
 
 
-@settings(SETTINGS, max_examples=60)
+@settings(SETTINGS, max_examples=40)
 @given(st.lists(WORDS, min_size=1, max_size=6))
 def test_any_command_line_is_understood_or_refused(words):
     err, out, code = io.StringIO(), io.StringIO(), 0
