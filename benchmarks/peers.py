@@ -11,7 +11,7 @@ from typing import Any
 import gymnasium
 
 from dgae_jax.envs.registry import TASKS
-from dgae_jax.physics.registry import cores
+from dgae_jax.physics import cores
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,7 @@ import tyro
 from throughput import iteration, setting
 
 from dgae_jax.configs.resolved import ResolvedConfig
-from dgae_jax.physics.registry import cores
+from dgae_jax.physics import cores
 from dgae_jax.run import runtime
 
 

@@ -40,7 +40,7 @@ from dgae_jax.learn.build import make_policy, make_task, make_trainer, seed_keys
 from dgae_jax.learn.iteration import _estimate, _roll_out, sampler
 from dgae_jax.learn.parallel import COMPILER_OPTIONS
 from dgae_jax.learn.types import InferenceState
-from dgae_jax.physics.registry import cores
+from dgae_jax.physics import cores
 from dgae_jax.run import runtime
 from dgae_jax.run.options import RunOptions
 

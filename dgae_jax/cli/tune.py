@@ -108,7 +108,7 @@ def _storage(url: str | None) -> str | None:
 
 
 def _workers(args: Arguments) -> int:
-    from dgae_jax.physics.registry import cores
+    from dgae_jax.physics import cores
 
     if args.workers is None:
         return min(cores(), args.trials)

@@ -1,10 +1,9 @@
-"""Brax's own environments under our trainer, and our tasks under Brax's.
+"""Our tasks under Brax's trainers.
 
-Importing this registers our tasks with Brax as `dgae_ant`, `dgae_hopper`, `dgae_swimmer` and
+Importing this registers them with Brax as `dgae_ant`, `dgae_hopper`, `dgae_swimmer` and
 `dgae_walker2d`: `brax.envs.get_environment("dgae_hopper", physics="jax")`.
 """
 
-import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial
@@ -15,26 +14,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
-from dgae_jax.envs.base import Env, brax
-from dgae_jax.envs.custom import CustomTask
-from dgae_jax.envs.registry import BRAX, TASKS, make_env
-from dgae_jax.physics.native import silence_warnings
-
-
-def make_brax(name: str, physics: str, **parameters) -> Env:
-    """Build one of Brax's own environments on its MJX backend, with actions in [−1, 1].
-
-    Raises:
-        ValueError: if Brax cannot build it.
-    """
-    try:
-        with warnings.catch_warnings(), silence_warnings():
-            warnings.simplefilter("ignore")  # of features of the model files that Brax leaves out
-            return CustomTask(brax.envs.get_environment(name, backend=physics, **parameters))
-    except (ValueError, TypeError) as reason:
-        raise ValueError(
-            f"environment {BRAX}{name}: must be one that Brax can build on {physics} ({reason})"
-        ) from None
+from dgae_jax.envs.base import brax
+from dgae_jax.envs.registry import TASKS, make_env
 
 
 @contextmanager

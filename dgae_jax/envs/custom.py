@@ -1,12 +1,14 @@
-"""Custom environments, given as objects."""
+"""Brax's own environments, and custom ones that are given as objects."""
 
+import warnings
 from typing import Any
 
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from dgae_jax.envs.base import Env, State, Wrapper, restart
+from dgae_jax.envs.base import Env, State, Wrapper, brax, restart
 from dgae_jax.envs.env_checker import check_env
+from dgae_jax.physics.native import silence_warnings
 
 
 class CustomTask(Wrapper):
@@ -39,3 +41,19 @@ def make_custom(env: Any) -> CustomTask:
         raise ValueError(f"{type(env).__name__} is not a brax.envs.base.Env")
     check_env(env)
     return CustomTask(env)
+
+
+def make_brax(name: str, physics: str, **parameters) -> Env:
+    """Build one of Brax's own environments on its MJX backend, with actions in [−1, 1].
+
+    Raises:
+        ValueError: if Brax cannot build it.
+    """
+    try:
+        with warnings.catch_warnings(), silence_warnings():
+            warnings.simplefilter("ignore")  # of features of the model files that Brax leaves out
+            return CustomTask(brax.envs.get_environment(name, backend=physics, **parameters))
+    except (ValueError, TypeError) as reason:
+        raise ValueError(
+            f"environment brax:{name}: must be one that Brax can build on {physics} ({reason})"
+        ) from None

@@ -103,7 +103,7 @@ def _brax(name: str) -> EnvSpec:
         raise ValueError(f"{BRAX}NAME with NAME one of {', '.join(sorted(names))}")
 
     def build(physics, version, **task_parameters) -> "Env":
-        from dgae_jax.envs.brax import make_brax
+        from dgae_jax.envs.custom import make_brax
 
         return make_brax(name, physics, **task_parameters)
 

@@ -18,9 +18,8 @@ import numpy as np
 from jaxtyping import Array
 from mujoco.batch import Batch
 
-from dgae_jax.physics import ffi
+from dgae_jax.physics import cores, ffi
 from dgae_jax.physics.engine import Physics, PhysicsState, Reads, body_ids, refuse_hidden_state
-from dgae_jax.physics.registry import cores
 
 _LOG = logging.getLogger(__name__)
 _INPUTS = ("qpos", "qvel", "qacc_warmstart")

@@ -3,7 +3,6 @@
 Importing this loads no engine: names are checked before JAX or MuJoCo are imported.
 """
 
-import os
 from importlib.util import find_spec
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -79,8 +78,3 @@ def make_physics(name: str, spec: "mujoco.MjSpec", frame_skip: int, reads: "Read
     """
     require(name)
     return ENGINES[name].build(spec, frame_skip, reads)
-
-
-def cores() -> int:
-    """Return the number of cores that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

@@ -25,7 +25,8 @@ from dgae_jax.configs.config import ConfigError, invalid
 from dgae_jax.configs.resolved import ResolvedConfig
 from dgae_jax.envs.registry import spec_of
 from dgae_jax.learn.devices import divide_cpu
-from dgae_jax.physics.registry import ENGINES, cores
+from dgae_jax.physics import cores
+from dgae_jax.physics.registry import ENGINES
 from dgae_jax.run import terminal
 from dgae_jax.run.options import RunOptions
 

@@ -20,7 +20,7 @@ from typing import Any
 
 from dgae_jax.configs.config import ConfigError, invalid
 from dgae_jax.configs.validation import lookup
-from dgae_jax.physics.registry import cores
+from dgae_jax.physics import cores
 from dgae_jax.study.worker import Job, execute
 
 
