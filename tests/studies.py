@@ -1,5 +1,6 @@
 """Small sweeps and tunings by the real commands."""
 
+import os
 import subprocess
 import sys
 import time
@@ -43,3 +44,9 @@ def rows(sweep):
     """Return the results without their times."""
     found = metrics.read(sweep / "results.jsonl")
     return [{k: v for k, v in row.items() if k not in TIMES} for row in found]
+
+
+def children():
+    """Return the ids of the processes that this one started."""
+    found = subprocess.run(["ps", "--ppid", str(os.getpid()), "-o", "pid="], capture_output=True)
+    return [int(word) for word in found.stdout.split()]

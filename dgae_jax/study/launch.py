@@ -1,7 +1,7 @@
 """Launchers of a sweep: this machine, a Ray cluster or Slurm.
 
 A launcher is `launch(jobs, options)`, a context in which all jobs are on their way. The result of
-a task is the exit code of its run. On leaving the context, runs that are not done stop with a
+a task is the exit code of its job. On leaving the context, jobs that are not done stop with a
 checkpoint; those of Slurm continue.
 """
 
@@ -116,35 +116,19 @@ def ray_cluster(jobs: Sequence[Job], options: LaunchOptions) -> Iterator[Tasks]:
 
 
 def _check_ray(options: LaunchOptions) -> None:
-    address = options.address
-    is_remote = address not in (None, "auto", "local")
-    host, _, port = str(address).removeprefix("ray://").rpartition(":")
-    if is_remote and not (host and port.isdigit()):
-        raise invalid("address", address, "HOST:PORT of a cluster, or auto")
+    if options.address not in (None, "auto", "local"):
+        host, _, port = str(options.address).removeprefix("ray://").rpartition(":")
+        try:  # ray.init waits for minutes
+            socket.create_connection((host, int(port)), timeout=5.0).close()
+        except (OSError, OverflowError, ValueError) as reason:
+            allowed = f"auto, or HOST:PORT where a Ray cluster answers ({reason})"
+            raise invalid("address", options.address, allowed) from reason
     if not find_spec("ray"):
         raise invalid("launcher", "ray", 'used with Ray installed: pip install "dgae_jax[ray]"')
-    if is_remote:  # ray.init waits for minutes
-        try:
-            socket.create_connection((host, int(port)), timeout=5.0).close()
-        except (OSError, OverflowError) as reason:
-            allowed = f"where a Ray cluster answers ({reason})"
-            raise invalid("address", address, allowed) from reason
 
 
 SLURM_EXECUTOR = "slurm"
 """Name of submitit's executor; tests use its `local` one."""
-
-
-class _ResumableJob:
-    """Function that submitit calls, and submits again if the job was preempted or timed out."""
-
-    def __call__(self, job: Job) -> int:
-        return execute(job)
-
-    def checkpoint(self, job: Job) -> Any:
-        from submitit.helpers import DelayedSubmission
-
-        return DelayedSubmission(self, job)
 
 
 @contextlib.contextmanager
@@ -152,14 +136,18 @@ def slurm_array(jobs: Sequence[Job], options: LaunchOptions) -> Iterator[Tasks]:
     """Run jobs as one Slurm array, which outlives this process."""
     import submitit
 
-    folder = jobs[0].sweep.path / "slurm" / "%j"
+    class Resumable(submitit.helpers.Checkpointable):  # submitted again if it was preempted
+        def __call__(self, job: Job) -> int:
+            return execute(job)
+
+    folder = jobs[0].log.parent.parent / "slurm" / "%j"
     executor = submitit.AutoExecutor(folder=folder, cluster=SLURM_EXECUTOR)
     gpus = {"gpus_per_node": int(options.gpus_per_run)} if options.gpus_per_run else {}
     try:
         executor.update_parameters(
             name="dgae", cpus_per_task=options.cpus_per_run, **gpus, **slurm_parameters(options)
         )
-        submitted: Any = executor.map_array(_ResumableJob(), jobs)
+        submitted: Any = executor.map_array(Resumable(), jobs)
     except (NameError, TypeError, submitit.core.utils.FailedSubmissionError) as reason:
         allowed = f"must be settings that submitit and Slurm take ({str(reason)[:300]})"
         raise ConfigError(f"slurm: {allowed}", "slurm") from reason
@@ -192,14 +180,14 @@ LAUNCHERS: dict[str, Launcher] = {"local": local, "ray": ray_cluster, "slurm": s
 
 CHECKS = {"ray": _check_ray, "slurm": _check_slurm}
 
-USED_BY = {
-    "processes": ("local",),
-    "address": ("ray",),
-    "cpus_per_run": ("ray", "slurm"),
-    "gpus_per_run": ("ray", "slurm"),
-    "slurm": ("slurm",),
+RANGES = {
+    "processes": (("local",), 1, 1024),
+    "address": (("ray",), None, None),
+    "cpus_per_run": (("ray", "slurm"), 1, 1024),
+    "gpus_per_run": (("ray", "slurm"), 0, 64),
+    "slurm": (("slurm",), None, None),
 }
-"""The launchers that use a setting."""
+"""The launchers that use a setting, and its least and largest value."""
 
 
 def launcher(options: LaunchOptions) -> Launch:
@@ -209,18 +197,15 @@ def launcher(options: LaunchOptions) -> Launch:
         ConfigError: an option is invalid, or Ray or Slurm is not there.
     """
     found = lookup("launcher", options.launcher, LAUNCHERS)
-    for name, used_by in USED_BY.items():
+    for name, (used_by, low, high) in RANGES.items():
         value = getattr(options, name)
-        if value != getattr(LaunchOptions(), name) and options.launcher not in used_by:
-            raise invalid(
-                name, value, f"unset: it has no effect with --launcher {options.launcher}"
-            )
-    for name in ("processes", "cpus_per_run"):
-        value = getattr(options, name)
-        if value is not None and not 1 <= value <= 1024:
-            raise invalid(name, value, "a whole number from 1 to 1,024")
-    if not 0 <= options.gpus_per_run <= 64:
-        raise invalid("gpus_per_run", options.gpus_per_run, "from 0 to 64")
+        if value == getattr(LaunchOptions, name):
+            continue
+        if options.launcher not in used_by:
+            allowed = f"unset: it has no effect with --launcher {options.launcher}"
+            raise invalid(name, value, allowed)
+        if low is not None and not low <= value <= high:
+            raise invalid(name, value, f"from {low} to {high:,}")
     if options.launcher in CHECKS:
         CHECKS[options.launcher](options)
     return lambda jobs: found(jobs, options)

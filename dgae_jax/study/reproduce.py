@@ -1,9 +1,9 @@
 """Train a sweep: launch the runs that are not done, show their progress, keep their results."""
 
 import contextlib
+import dataclasses
 import json
 import os
-import sys
 import time
 from collections.abc import Sequence
 from pathlib import Path
@@ -11,7 +11,6 @@ from typing import Any
 
 import jax
 import numpy as np
-from rich.console import Console
 
 from dgae_jax.configs.resolved import ResolvedConfig
 from dgae_jax.configs.serial import digest, to_dict
@@ -20,13 +19,10 @@ from dgae_jax.run.options import RunOptions
 from dgae_jax.run.runtime import Signals
 from dgae_jax.study.launch import Launch
 from dgae_jax.study.sweep import RunSpec, Sweep
-from dgae_jax.study.worker import Job
+from dgae_jax.study.worker import Job, train_run
 
 POLL = 0.5
 """Time between looks at the tasks [s]."""
-
-PLAIN_EVERY = 30.0
-"""Time between lines where there is no terminal [s]."""
 
 TAIL = 16_384
 """Bytes at the end of a metrics file that hold its last row."""
@@ -56,35 +52,44 @@ def reproduce(sweep: Sweep, runs: Sequence[RunSpec], options: RunOptions, launch
     jax.config.update("jax_platforms", "cpu")  # accelerators are left to the runs
     rows = read_results(sweep)
     write_results(sweep, rows)
-    jobs = [Job(sweep, run, options) for run in runs if run.name not in rows]
+    missing = {run.name: run for run in runs if run.name not in rows}
+    jobs = [_job(sweep, run, options) for run in missing.values()]
     left = f", {len(jobs)} to train" if jobs else ""
     terminal.say(f"{sweep.path}: {len(runs) - len(jobs)} of {len(runs)} runs are done{left}")
+    progress, done, failed = Progress(sweep, list(missing.values())), [], []
     with (
         Signals() as signals,
-        Progress(sweep, [job.run for job in jobs]) as progress,
+        terminal.Reporter() as reporter,
         launch(jobs) if jobs else contextlib.nullcontext({}) as tasks,
     ):
         waiting = dict(tasks)
         while waiting and not signals.received:
             for task in [task for task in waiting if task.done()]:
-                run = waiting.pop(task).run
+                run = missing[waiting.pop(task).name]
                 if reason := _failure(sweep, run, task):
-                    progress.note(run, "failed", f"{run.name}: {reason}")
+                    failed.append(run.name)
+                    terminal.say(f"{run.name}: {reason}")
                     continue
+                done.append(run.name)
                 rows[run.name] = rows_of(sweep, run)
                 write_results(sweep, rows)
-                progress.note(run, "done", _summary(run, rows[run.name]))
-            progress.show()
+                terminal.say(_summary(run, rows[run.name]))
+            reporter.watch(progress.line(len(done), len(failed)))
             time.sleep(POLL)
         if waiting:
             terminal.say(f"stopping {len(waiting)} runs")
     if signals.received:
         terminal.say(f"stopped by {signals.name}; the same command continues")
         return signals.exit_code
-    failed = [name for name, state in progress.ended.items() if state == "failed"]
     for name in failed:
         terminal.warn(f"failed: {name}, see {sweep.path / 'logs' / name}.log")
     return 1 if failed else 0
+
+
+def _job(sweep: Sweep, run: RunSpec, options: RunOptions) -> Job:
+    where = {"run_dir": sweep.run_dir(run).absolute(), "resume_or_start": True}
+    args = run.config, dataclasses.replace(options, num_processes=1, **where)
+    return Job(run.name, train_run, args, sweep.log(run).absolute())
 
 
 def _failure(sweep: Sweep, run: RunSpec, task: Any) -> str | None:
@@ -117,53 +122,24 @@ def reached(sweep: Sweep, run: RunSpec) -> int:
 
 
 class Progress:
-    """Shows how far the runs are, as a status line on a terminal and as lines elsewhere."""
+    """How far the runs are."""
 
     def __init__(self, sweep: Sweep, runs: Sequence[RunSpec]):
-        self.sweep, self.runs, self.ended = sweep, runs, dict[str, str]()
-        self.began = self.printed = time.monotonic()
-        self.steps_before = self._steps()
-        console = Console(file=terminal.Steady(sys.stdout))
-        self.status = console.status("") if terminal.is_live() else None
-
-    def __enter__(self) -> "Progress":
-        if self.status:
-            self.status.start()
-        return self
-
-    def __exit__(self, *_) -> None:
-        if self.status:
-            self.status.stop()
-
-    def note(self, run: RunSpec, state: str, text: str) -> None:
-        """Note that a run is done or has failed, and print a line about it."""
-        self.ended[run.name] = state
-        if self.status:
-            self.status.console.print(text, markup=False, highlight=False)
-        else:
-            terminal.say(text)
-
-    def show(self) -> None:
-        """Read what the runs have written, and show it."""
-        if self.status:
-            self.status.update(self._line())
-        elif time.monotonic() - self.printed > PLAIN_EVERY:
-            self.printed = time.monotonic()
-            terminal.say(self._line())
+        self.sweep, self.runs, self.began = sweep, runs, time.monotonic()
+        self.before = self._steps()
 
     def _steps(self) -> int:
         return sum(reached(self.sweep, run) * run.config.num_seeds for run in self.runs)
 
-    def _line(self) -> str:
+    def line(self, done: int, failed: int) -> str:
+        """Return counts of runs and steps, and the time left at the speed so far."""
         configs = [run.config for run in self.runs]
         total = sum(c.iterations * c.samples_per_iteration * c.num_seeds for c in configs)
         steps, seconds = self._steps(), time.monotonic() - self.began
-        made = steps - self.steps_before
+        made = steps - self.before
         clock = terminal.clock((total - steps) * seconds / made) if made else "unknown"
-        states = list(self.ended.values())
-        counts = f"{states.count('done')} done, {states.count('failed')} failed"
-        of = f"of {len(self.runs)} runs; {steps:,} of {total:,} steps"
-        return f"{counts} {of}, time left {clock}"
+        counts = f"{done} done, {failed} failed of {len(self.runs)} runs"
+        return f"{counts}; {steps:,} of {total:,} steps, time left {clock}"
 
 
 def is_done(sweep: Sweep, run: RunSpec) -> bool:

@@ -13,11 +13,11 @@ from dgae_jax.study.launch import LaunchOptions, launcher, slurm_parameters
     ("options", "message"),
     [
         ({"launcher": "cloud"}, "launcher cloud: must be one of local, ray, slurm"),
-        ({"processes": 0}, "processes 0: must be a whole number from 1 to 1,024"),
+        ({"processes": 0}, "processes 0: must be from 1 to 1,024"),
         ({"launcher": "ray", "processes": 2}, "processes 2: must be unset"),
         ({"address": "auto"}, "address auto: must be unset"),
-        ({"launcher": "ray", "address": "head"}, "address head: must be HOST:PORT"),
-        ({"launcher": "ray", "cpus_per_run": 0}, "cpus_per_run 0: must be a whole number"),
+        ({"launcher": "ray", "address": "head"}, "address head: must be auto, or HOST:PORT"),
+        ({"launcher": "ray", "cpus_per_run": 0}, "cpus_per_run 0: must be from 1"),
         ({"launcher": "ray", "gpus_per_run": -1}, "gpus_per_run -1: must be from 0 to 64"),
     ],
 )

@@ -3,36 +3,32 @@
 import dataclasses
 
 import pytest
-from optuna.distributions import CategoricalDistribution, FloatDistribution, IntDistribution
+from optuna.trial import FixedTrial
 
 from dgae_jax.configs.config import Config, ConfigError
 from dgae_jax.configs.resolved import resolve
-from dgae_jax.study.search import Tuning, shown, space_of, values_of, with_values
+from dgae_jax.study.search import Tuning, space_of
 
 PPO = resolve(Config(algo="ppo", physics="native"))
 
 
 @pytest.mark.parametrize(
-    ("word", "distribution", "again"),
+    ("word", "kind", "ends", "options"),
     [
-        ("gamma=0.9:0.999", FloatDistribution(0.9, 0.999), "0.9:0.999"),
-        (
-            "policy.learning-rate=log:1e-4:1e-2",
-            FloatDistribution(1e-4, 1e-2, log=True),
-            "log:0.0001:0.01",
-        ),
-        ("num_envs=int:4:64", IntDistribution(4, 64), "int:4:64"),
-        ("policy.epochs=int:log:1:20", IntDistribution(1, 20, log=True), "int:log:1:20"),
-        ("critic.minibatches=16,32,64", CategoricalDistribution((16, 32, 64)), "16,32,64"),
-        ("normalize_rewards=true,false", CategoricalDistribution((True, False)), "True,False"),
-        ("policy.hidden=64x64,256", CategoricalDistribution(("64x64", 256)), "64x64,256"),
+        ("gamma=0.9:0.999", "float", (0.9, 0.999), {"log": False}),
+        ("policy.learning-rate=log:1e-4:1e-2", "float", (1e-4, 1e-2), {"log": True}),
+        ("num_envs=int:4:64", "int", (4, 64), {"log": False}),
+        ("policy.epochs=int:log:1:20", "int", (1, 20), {"log": True}),
+        ("critic.minibatches=16,32,64", "categorical", (16, 32, 64), {}),
+        ("normalize_rewards=true,false", "categorical", (True, False), {}),
+        ("policy.hidden=64x64,256", "categorical", ("64x64", 256), {}),
     ],
 )
-def test_a_word_becomes_an_optuna_distribution(word, distribution, again):
+def test_a_word_becomes_values_that_optuna_suggests(word, kind, ends, options):
     ((path, found),) = space_of([word], PPO).items()
     assert path == word.partition("=")[0].replace("-", "_")
-    assert found == distribution
-    assert shown(found) == again
+    assert (found.kind, found.ends, found.options) == (kind, ends, options)
+    assert found.suggest(FixedTrial({path: ends[1]}), path) == ends[1]
 
 
 @pytest.mark.parametrize(
@@ -48,7 +44,6 @@ def test_a_word_becomes_an_optuna_distribution(word, distribution, again):
         ("num_envs=4:64", "num_envs: must be int, not 4.0"),
         ("num_envs=int:4.5:64", "must be SETTING="),
         ("gamma=0.9", "must be SETTING="),
-        ("critic.minibatches=int:16:32", "critic.minibatches 17: must be a divisor"),
         ("policy.max_kl=0.01:0.1", "it has no effect with ppo"),
         ("policy.optimizer=adam,sgd", "policy.optimizer sgd: must be one of adam, rmsprop"),
     ],
@@ -57,30 +52,24 @@ def test_an_invalid_search_is_refused_by_its_word(word, reason):
     with pytest.raises(ConfigError, match=reason) as refused:
         space_of(["gae_lambda=0.5:1", word], PPO)
     assert str(refused.value).startswith(f"search {word}: must be ")
-    assert refused.value.setting == "search"
-
-
-def test_values_are_put_into_a_configuration_and_read_from_it():
-    values = {"gamma": 0.5, "policy.hidden": "32x16"}
-    changed = with_values(PPO, {**values, "critic.minibatches": 16})
-    assert (changed.gamma, changed.policy.hidden) == (0.5, (32, 16))
-    assert changed.critic.fit["minibatches"] == 16
-    assert values_of(changed, dict.fromkeys(values)) == values
-    assert with_values(changed, values_of(PPO, dict.fromkeys(values))).policy == PPO.policy
 
 
 def test_trials_have_seeds_that_reports_do_not_use(tmp_path):
-    tuning = Tuning(PPO, space_of(["gamma=0.9:0.999"], PPO), tmp_path, seeds=3)
-    config = tuning.trial_config({"gamma": 0.95})
-    assert (config.seed, config.num_seeds, config.gamma) == (1000, 3, 0.95)
-    best = tuning.best_config({"gamma": 0.95})
-    assert best == dataclasses.replace(config, seed=0, num_seeds=1)
-
-
-def test_a_start_outside_of_the_space_is_no_trial(tmp_path):
-    inside, outside = (
-        Tuning(PPO, space_of([word], PPO), tmp_path)
-        for word in ("gamma=0.9:0.999", "gamma=0.995:0.999")
+    config = Tuning(PPO, {}, tmp_path, seeds=3).trial_config(
+        {"gamma": 0.95, "policy.hidden": "32x16", "critic.hidden": 8}
     )
-    assert inside.start_values() == {"gamma": 0.99}
-    assert outside.start_values() is None
+    assert (config.seed, config.num_seeds, config.gamma) == (1000, 3, 0.95)
+    assert (config.policy.hidden, config.critic.hidden) == ((32, 16), (8,))
+
+
+@pytest.mark.parametrize(
+    ("words", "start"),
+    [
+        (["gamma=0.9:0.999"], {"gamma": 0.99}),
+        (["policy.hidden=64x64,32", "gamma=0.9,0.99"], {"policy.hidden": "64x64", "gamma": 0.99}),
+        (["gamma=0.995:0.999"], None),
+    ],
+)
+def test_the_first_trial_is_the_configuration_if_it_is_inside(tmp_path, words, start):
+    config = dataclasses.replace(PPO, policy=dataclasses.replace(PPO.policy, hidden=(64, 64)))
+    assert Tuning(config, space_of(words, config), tmp_path).start_values() == start
