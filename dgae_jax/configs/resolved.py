@@ -147,7 +147,7 @@ def resolve(config: Config | ResolvedConfig, algo: str | None = None) -> Resolve
         env_version=config.env_version or spec.default_version,
         algo=algo,
         residual=config.residual or row.residual,
-        physics=config.physics or spec.default_engine,
+        physics=config.physics or spec.engines[0],
         policy=ResolvedPolicy(
             policy.hidden, policy.covariance, policy.initial_std, update, _filled(policy, options)
         ),

@@ -32,11 +32,7 @@ def with_range(env: Env) -> Env:
 
 
 def make_custom(env: Any) -> CustomTask:
-    """Check and wrap an env.
-
-    Raises:
-        ValueError: if the trainer cannot take the object.
-    """
+    """Check and wrap an env; raise ValueError if the trainer cannot take it."""
     if not isinstance(env, Env):
         raise ValueError(f"{type(env).__name__} is not a brax.envs.base.Env")
     check_env(env)
@@ -44,11 +40,7 @@ def make_custom(env: Any) -> CustomTask:
 
 
 def make_brax(name: str, physics: str, **parameters) -> Env:
-    """Build one of Brax's own environments on its MJX backend, with actions in [−1, 1].
-
-    Raises:
-        ValueError: if Brax cannot build it.
-    """
+    """Build one of Brax's own environments on its MJX backend, with actions in [−1, 1]."""
     try:
         with warnings.catch_warnings(), silence_warnings():
             warnings.simplefilter("ignore")  # of features of the model files that Brax leaves out

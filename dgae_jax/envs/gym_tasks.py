@@ -118,8 +118,5 @@ class Ant(HealthyTask):
 
 
 GYM_TASKS: dict[str, type[Task]] = {
-    "ant": Ant,
-    "hopper": Hopper,
-    "swimmer": Swimmer,
-    "walker2d": Walker2d,
+    task.NAME.lower(): task for task in (Ant, Hopper, Swimmer, Walker2d)
 }

@@ -11,7 +11,7 @@ import itertools
 import warnings
 import weakref
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple, cast
+from typing import Any, NamedTuple
 
 import gymnasium
 import jax
@@ -28,12 +28,10 @@ _NO_EPISODE = (-1, -1)
 
 
 class Position(NamedTuple):
-    """The position of a Gymnasium env in its episode."""
+    """Seed of an env's episode, high half and low half, and number of its steps so far."""
 
     seed: UInt32[Array, " 2"]
-    """Seed of its episode, high half and low half."""
     steps: Int[Array, ""]
-    """Steps since the episode began."""
 
 
 class ClipAction(gymnasium.ActionWrapper):
@@ -62,8 +60,7 @@ def make_gym_env(name: str, **parameters) -> gymnasium.Env:
         vector = isinstance(space, Box) and len(space.shape) == 1
         if not vector or (kind == "actions" and np.dtype(space.dtype).kind != "f"):
             env.close()
-            allowed = "a Box with one axis of real numbers"
-            raise ValueError(f"its {kind} are {space}, and must be {allowed}")
+            raise ValueError(f"its {kind} are {space}, and must be a Box with one axis of floats")
     return ClipAction(env)
 
 
@@ -120,9 +117,8 @@ class GymnasiumTask(ThirdPartyEnv):
 
     def __init__(self, name: str, **parameters):
         first = make_gym_env(name, **parameters)
-        observations, actions = (
-            cast(Box, s) for s in (first.observation_space, first.action_space)
-        )
+        observations: Any = first.observation_space
+        actions: Any = first.action_space
         self.observation_size, self.action_size = observations.shape[0], actions.shape[0]
         self.action_range = jnp.asarray(actions.low, float), jnp.asarray(actions.high, float)
         self._envs = _Envs(lambda: make_gym_env(name, **parameters), first)

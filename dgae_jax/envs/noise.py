@@ -32,11 +32,6 @@ class Noisy(Wrapper):
         self._reward, self._action = reward, action
         self._observation, self._initial = observation, initial
 
-    @property
-    def action_range(self) -> tuple[Array, Array]:
-        """The range of the task's actions."""
-        return self.env.action_range
-
     def reset(self, rng: Array) -> State:
         """Return the task's own start, moved and seen with noise."""
         return self._begin(rng, self.env.reset)

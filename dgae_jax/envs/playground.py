@@ -14,9 +14,6 @@ from dgae_jax.envs.base import Env, State, ThirdPartyEnv
 from dgae_jax.physics.native import silence_warnings
 from dgae_jax.physics.registry import require
 
-IMPL = {"mjx": "jax", "mjx-warp": "warp"}
-"""Implementation of MJX for each of our engines."""
-
 
 class PlaygroundTask(ThirdPartyEnv):
     """A task with its own time limit and action repeat, as Playground's trainers wrap it.
@@ -53,12 +50,7 @@ def _state(inner: Any) -> State:
 
 
 def make_playground(name: str, physics: str, **parameters) -> Env:
-    """Build a task of Playground; `parameters` override its configuration.
-
-    Raises:
-        ValueError: if the task does not exist, cannot be trained on, or its robot's files are
-            missing.
-    """
+    """Build a task of Playground, if possible; `parameters` override its configuration."""
     require(physics)
     with warnings.catch_warnings(), silence_warnings():
         warnings.simplefilter("ignore")
@@ -69,11 +61,11 @@ def make_playground(name: str, physics: str, **parameters) -> Env:
             near = get_close_matches(name, registry.ALL_ENVS, 3) or dm_control_suite.ALL_ENVS
             raise ValueError(f"Playground has no {name}, but {', '.join(near)}")
         if name not in dm_control_suite.ALL_ENVS and not MENAGERIE_PATH.exists():
-            where = f"which Playground looks for in {MENAGERIE_PATH} and would download"
-            raise ValueError(f"its robot is in mujoco_menagerie, {where}")
+            raise ValueError(f"its robot is in {MENAGERIE_PATH}, which Playground would download")
         config: Any = registry.get_default_config(name).lock()  # refuses unknown names
+        impl = {"mjx": "jax", "mjx-warp": "warp"}[physics]
         try:
-            config.update_from_flattened_dict({"impl": IMPL[physics], **parameters})
+            config.update_from_flattened_dict({"impl": impl, **parameters})
         except (AttributeError, KeyError, TypeError) as reason:
             raise ValueError(f"its configuration is {', '.join(config)}: {reason}") from reason
         env = registry.load(name, config)

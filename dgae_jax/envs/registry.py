@@ -1,10 +1,10 @@
-"""The tasks by name: builder, engines, and the Gymnasium env that evaluates them.
+"""The tasks by name: engines, versions, and the Gymnasium env that evaluates them.
 
 Importing this loads no task: names are checked before JAX, MuJoCo and Brax are imported.
 """
 
 import sys
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -14,9 +14,6 @@ from dgae_jax.physics.registry import ENGINES
 if TYPE_CHECKING:
     from dgae_jax.envs.base import Env
 
-BRAX, PLAYGROUND, GYMNASIUM, CUSTOM = "brax:", "playground:", "gymnasium:", "custom:"
-"""Prefixes of third-party tasks, and of envs that are given as objects."""
-
 BRAX_NAMES = (
     "ant", "fast", "halfcheetah", "hopper", "humanoid", "humanoidstandup", "inverted_pendulum",
     "inverted_double_pendulum", "pusher", "reacher", "walker2d",
@@ -24,27 +21,23 @@ BRAX_NAMES = (
 """Brax's own environments that it builds on its MJX backend; its swimmer is not one of them."""
 
 CUSTOM_ENVS: dict[str, Any] = {}
-"""Envs that were given as objects, by their names with the prefix."""
+"""Envs that were given as objects, by their names with the prefix `custom:`."""
 
 
 class EnvSpec(NamedTuple):
     """A task that can be built and evaluated."""
 
-    build: Callable[..., "Env"]
-    """Called with physics, version and task parameters."""
     engines: tuple[str, ...]
     """Engines that the task runs on; the first is the default."""
-    eval_envs: Mapping[str, str]
+    eval_envs: Mapping[str, str] = {}
     """Gymnasium's id for each version, the default first; empty for a task without versions."""
     gymnasium_id: str | None = None
     """Gymnasium's id of a third-party task of Gymnasium."""
-    on_host: bool = False
-    """True if its envs are Python objects: for a CPU, a single device, and no exact resume."""
 
     @property
-    def default_engine(self) -> str:
-        """The engine where none is named."""
-        return self.engines[0]
+    def on_host(self) -> bool:
+        """True if its envs are Python objects: for a CPU, a single device, and no exact resume."""
+        return self.gymnasium_id is not None
 
     @property
     def default_version(self) -> str | None:
@@ -60,94 +53,11 @@ class EnvSpec(NamedTuple):
         """Return Gymnasium's id of the evaluation env; None if the task evaluates itself."""
         return self.eval_envs[version or self.versions[0]] if self.versions else self.gymnasium_id
 
-    def choose(
-        self, physics: str | None = None, version: str | None = None
-    ) -> tuple[str, str | None]:
-        """Return engine and version, with the defaults filled in.
-
-        Raises:
-            ValueError: if the task does not have them.
-        """
-        physics = self.default_engine if physics is None else physics
-        version = self.default_version if version is None else version
-        if physics not in self.engines:
-            raise ValueError(f"physics {physics}: must be one of {', '.join(self.engines)}")
-        if version is not None and version not in self.versions:
-            allowed = f"one of {', '.join(self.versions)}" if self.versions else "left out"
-            raise ValueError(f"version {version}: must be {allowed}")
-        return physics, version
-
-
-def _gym_task(name: str) -> EnvSpec:
-    def build(physics, version, **task_parameters) -> "Env":
-        from dgae_jax.envs.gym_tasks import GYM_TASKS
-
-        return GYM_TASKS[name.lower()].make(physics, version, **task_parameters)
-
-    return EnvSpec(build, tuple(ENGINES), {v: f"{name}-{v}" for v in ("v4", "v5")})
-
 
 TASKS = {
-    "ant": _gym_task("Ant"),
-    "hopper": _gym_task("Hopper"),
-    "swimmer": _gym_task("Swimmer"),
-    "walker2d": _gym_task("Walker2d"),
+    name.lower(): EnvSpec(tuple(ENGINES), {v: f"{name}-{v}" for v in ("v4", "v5")})
+    for name in ("Ant", "Hopper", "Swimmer", "Walker2d")
 }
-
-
-def _brax(name: str) -> EnvSpec:
-    brax: Any = sys.modules.get("brax.envs")
-    registered = () if brax is None else brax._envs  # by users too
-    names = {*BRAX_NAMES, *(n for n in registered if not n.startswith("dgae_"))} - {"swimmer"}
-    if name not in names:
-        raise ValueError(f"{BRAX}NAME with NAME one of {', '.join(sorted(names))}")
-
-    def build(physics, version, **task_parameters) -> "Env":
-        from dgae_jax.envs.custom import make_brax
-
-        return make_brax(name, physics, **task_parameters)
-
-    return EnvSpec(build, ("mjx",), {})
-
-
-def _playground(name: str) -> EnvSpec:
-    if find_spec("mujoco_playground") is None:
-        install = 'pip install "dgae_jax[playground]"'
-        raise ValueError(f"used with the package playground, which is not installed: {install}")
-
-    def build(physics, version, **task_parameters) -> "Env":
-        from dgae_jax.envs.playground import make_playground
-
-        return make_playground(name, physics, **task_parameters)
-
-    return EnvSpec(build, ("mjx", "mjx-warp"), {})
-
-
-def _gymnasium(name: str) -> EnvSpec:
-    def build(physics, version, **task_parameters) -> "Env":
-        from dgae_jax.envs.gymnasium import GymnasiumTask
-
-        return GymnasiumTask(name, **task_parameters)
-
-    return EnvSpec(build, ("gymnasium",), {}, gymnasium_id=name, on_host=True)
-
-
-def _custom(name: str) -> EnvSpec:
-    env = CUSTOM_ENVS.get(CUSTOM + name)
-    if env is None:
-        calls = "dgae_jax.train(config, run_dir, env=…), load_policy(run_dir, env=…)"
-        raise ValueError(f"given as an object from Python: {calls}")
-
-    def build(physics, version) -> "Env":
-        from dgae_jax.envs.custom import make_custom
-
-        return make_custom(env)
-
-    return EnvSpec(build, ("custom",), {})
-
-
-PREFIXES = {BRAX: _brax, PLAYGROUND: _playground, GYMNASIUM: _gymnasium, CUSTOM: _custom}
-"""Lookup of the name after a prefix; raises ValueError with "one of …" for an unknown one."""
 
 NAMES = f"one of {', '.join(TASKS)}, or brax:NAME, playground:NAME or gymnasium:ID"
 """The names that a task may have, for messages."""
@@ -159,7 +69,7 @@ def custom_env(env: Any) -> Iterator[str | None]:
     if env is None:
         yield None
         return
-    name = CUSTOM + type(getattr(env, "unwrapped", env)).__name__
+    name = f"custom:{type(getattr(env, 'unwrapped', env)).__name__}"
     before, CUSTOM_ENVS[name] = CUSTOM_ENVS.get(name), env
     try:
         yield name
@@ -186,10 +96,27 @@ def spec_of(name: str) -> EnvSpec:
     """
     if name in TASKS:
         return TASKS[name]
-    for prefix, lookup in PREFIXES.items():
-        if name.startswith(prefix) and name != prefix:
-            return lookup(name.removeprefix(prefix))
-    raise ValueError(NAMES)
+    kind, _, own_name = name.partition(":")
+    if not own_name or kind not in ("brax", "playground", "gymnasium", "custom"):
+        raise ValueError(NAMES)
+    if kind == "gymnasium":
+        return EnvSpec(("gymnasium",), gymnasium_id=own_name)
+    if kind == "brax" and own_name not in (known := _brax_names()):
+        raise ValueError(f"brax:NAME with NAME one of {', '.join(sorted(known))}")
+    if kind == "playground" and find_spec("mujoco_playground") is None:
+        install = 'pip install "dgae_jax[playground]"'
+        raise ValueError(f"used with the package playground, which is not installed: {install}")
+    if kind == "custom" and name not in CUSTOM_ENVS:
+        calls = "dgae_jax.train(config, run_dir, env=…), load_policy(run_dir, env=…)"
+        raise ValueError(f"given as an object from Python: {calls}")
+    engines = {"brax": ("mjx",), "playground": ("mjx", "mjx-warp"), "custom": ("custom",)}
+    return EnvSpec(engines[kind])
+
+
+def _brax_names() -> set[str]:
+    brax: Any = sys.modules.get("brax.envs")
+    registered = () if brax is None else brax._envs  # by users too
+    return {*BRAX_NAMES, *(n for n in registered if not n.startswith("dgae_"))} - {"swimmer"}
 
 
 def make_env(
@@ -215,4 +142,30 @@ def make_env(
         spec = spec_of(name)
     except ValueError as allowed:
         raise ValueError(f"environment {name}: must be {allowed}") from None
-    return spec.build(*spec.choose(physics, version or named_version), **task_parameters)
+    engine = spec.engines[0] if physics is None else physics
+    version = version or named_version or spec.default_version
+    if engine not in spec.engines:
+        raise ValueError(f"physics {engine}: must be one of {', '.join(spec.engines)}")
+    if version is not None and version not in spec.versions:
+        allowed = f"one of {', '.join(spec.versions)}" if spec.versions else "left out"
+        raise ValueError(f"version {version}: must be {allowed}")
+    if name in TASKS:
+        from dgae_jax.envs.gym_tasks import GYM_TASKS
+
+        return GYM_TASKS[name].make(engine, str(version), **task_parameters)
+    if spec.gymnasium_id is not None:
+        from dgae_jax.envs.gymnasium import GymnasiumTask
+
+        return GymnasiumTask(spec.gymnasium_id, **task_parameters)
+    if name in CUSTOM_ENVS:
+        from dgae_jax.envs.custom import make_custom
+
+        return make_custom(CUSTOM_ENVS[name], **task_parameters)
+    kind, _, own_name = name.partition(":")
+    if kind == "brax":
+        from dgae_jax.envs.custom import make_brax
+
+        return make_brax(own_name, engine, **task_parameters)
+    from dgae_jax.envs.playground import make_playground
+
+    return make_playground(own_name, engine, **task_parameters)

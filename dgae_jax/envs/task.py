@@ -21,15 +21,9 @@ from dgae_jax.physics.registry import make_physics
 
 
 def load_spec(filename: str) -> mujoco.MjSpec:
-    """Read a model file of the installed gymnasium package, without importing gymnasium.
-
-    Args:
-        filename: name in Gymnasium's `assets`, `hopper.xml` for example.
-    """
-    spec = find_spec("gymnasium")
-    if spec is None or not spec.submodule_search_locations:
-        raise ModuleNotFoundError("the model files are those of gymnasium, which is not installed")
-    path = Path(spec.submodule_search_locations[0]) / "envs" / "mujoco" / "assets" / filename
+    """Read one of Gymnasium's model files, as `hopper.xml`, without importing gymnasium."""
+    package: Any = find_spec("gymnasium")
+    path = Path(package.origin).parent / "envs" / "mujoco" / "assets" / filename
     return mujoco.MjSpec.from_file(str(path))
 
 

@@ -1,7 +1,8 @@
 """The contract of a physics engine: advance a small state by one control interval.
 
-A task declares what it reads (`Reads`), and an engine returns it in a `PhysicsState`. Engines are
-functions of type `EngineBuilder`; `registry` names them.
+A task declares what it reads (`Reads`), and an engine returns it in a `PhysicsState`. An engine is
+a function of a model (`MjSpec`), the number of substeps and `Reads` that returns a `Physics`, or
+raises ValueError for a model that it does not cover; `registry` names them.
 """
 
 from typing import NamedTuple, Protocol, runtime_checkable
@@ -67,13 +68,6 @@ class Physics(NamedTuple):
         xpos = qpos[..., addresses[:, None] + np.arange(3)]
         forces = jnp.zeros((*batch, model.nbody if self.reads.forces else 0, 6), qpos.dtype)
         return PhysicsState(qpos, qvel, jnp.zeros_like(qvel), xpos, forces)
-
-
-@runtime_checkable
-class EngineBuilder(Protocol):
-    """Compile a model for an engine; raises ValueError for a model that it does not cover."""
-
-    def __call__(self, spec: mujoco.MjSpec, frame_skip: int, reads: Reads, /) -> Physics: ...
 
 
 def body_ids(model: mujoco.MjModel, reads: Reads) -> np.ndarray:

@@ -10,6 +10,7 @@ import functools
 import math
 from collections.abc import Callable, Sequence
 from ctypes import CFUNCTYPE, POINTER, c_char, c_char_p, c_int, c_int64, c_size_t, c_void_p
+from typing import Any
 
 import jax
 import numpy as np
@@ -22,59 +23,25 @@ Function = Callable[[Sequence[np.ndarray], Sequence[np.ndarray]], None]
 """Reads the arrays of its first argument and fills those of its second."""
 
 
-class _Struct(ctypes.Structure):
-    """Common header of the structures; names of fields are those of the C header."""
-
-    _fields_ = (("struct_size", c_size_t), ("extension", c_void_p))
-
-
-class _Buffer(_Struct):
-    _fields_ = (("dtype", c_int), ("data", c_void_p), ("rank", c_int64), ("dims", POINTER(c_int64)))
+def _struct(**fields: Any) -> Any:
+    """Return the type of a structure; the fields are named as in the C header."""
+    return type("Struct", (ctypes.Structure,), {"_fields_": list(fields.items())})
 
 
-class _Buffers(_Struct):
-    _fields_ = (("size", c_int64), ("types", c_void_p), ("buffers", POINTER(POINTER(_Buffer))))
-
-
-class _Version(_Struct):
-    _fields_ = (("major", c_int), ("minor", c_int))
-
-
-class _Metadata(ctypes.Structure):
-    _fields_ = (("struct_size", c_size_t), ("version", _Version), ("traits", ctypes.c_uint32))
-
-
-class _MetadataRequest(ctypes.Structure):
-    _fields_ = (
-        ("struct_size", c_size_t),
-        ("type", c_int),
-        ("next", c_void_p),
-        ("metadata", POINTER(_Metadata)),
-    )
-
-
-class _ErrorArguments(_Struct):
-    _fields_ = (("message", c_char_p), ("code", c_int))
-
-
-class _Api(_Struct):
-    _fields_ = (
-        ("version", _Version),
-        ("internal", c_void_p),
-        ("error_create", CFUNCTYPE(c_void_p, POINTER(_ErrorArguments))),
-    )
-
-
-class _CallFrame(_Struct):
-    _fields_ = (
-        ("api", POINTER(_Api)),
-        ("context", c_void_p),
-        ("stage", c_int),
-        ("arguments", _Buffers),
-        ("results", _Buffers),
-    )
-
-
+_HEADER = {"struct_size": c_size_t, "extension": c_void_p}
+_Buffer = _struct(**_HEADER, dtype=c_int, data=c_void_p, rank=c_int64, dims=POINTER(c_int64))
+_Buffers = _struct(**_HEADER, size=c_int64, types=c_void_p, buffers=POINTER(POINTER(_Buffer)))
+_Version = _struct(**_HEADER, major=c_int, minor=c_int)
+_Metadata = _struct(struct_size=c_size_t, version=_Version, traits=ctypes.c_uint32)
+_MetadataRequest = _struct(
+    struct_size=c_size_t, type=c_int, next=c_void_p, metadata=POINTER(_Metadata)
+)
+_ErrorArguments = _struct(**_HEADER, message=c_char_p, code=c_int)
+_CreateError = CFUNCTYPE(c_void_p, POINTER(_ErrorArguments))
+_Api = _struct(**_HEADER, version=_Version, internal=c_void_p, error_create=_CreateError)
+_CallFrame = _struct(
+    **_HEADER, api=POINTER(_Api), context=c_void_p, stage=c_int, args=_Buffers, rets=_Buffers
+)
 _Handler = CFUNCTYPE(c_void_p, POINTER(_CallFrame))
 _registered: dict[str, object] = {}  # XLA holds pointers to these
 
@@ -102,7 +69,7 @@ def _handle(function: Function, pointer) -> int | None:
         metadata.version.major, metadata.version.minor, metadata.traits = _MAJOR, _MINOR, 0
         return None
     try:
-        function(_arrays(frame.arguments), _arrays(frame.results))
+        function(_arrays(frame.args), _arrays(frame.rets))
     except BaseException as reason:  # nothing may leave through XLA
         message = f"{type(reason).__name__}: {reason}".encode()
         arguments = _ErrorArguments(ctypes.sizeof(_ErrorArguments), None, message, _INTERNAL)
@@ -110,7 +77,7 @@ def _handle(function: Function, pointer) -> int | None:
     return None
 
 
-def _arrays(buffers: _Buffers) -> list[np.ndarray]:
+def _arrays(buffers: Any) -> list[np.ndarray]:
     each = [buffers.buffers[i].contents for i in range(buffers.size)]
     return [_view(buffer.data, buffer.dtype, tuple(buffer.dims[: buffer.rank])) for buffer in each]
 

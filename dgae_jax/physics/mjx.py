@@ -82,8 +82,4 @@ def _substeps(
     data = data.replace(
         qpos=state.qpos, qvel=state.qvel, qacc_warmstart=state.qacc_warmstart, ctrl=ctrl
     )
-
-    def substep(data, _):
-        return upstream.step(model, data), None
-
-    return jax.lax.scan(substep, data, None, length=frame_skip)[0]
+    return jax.lax.fori_loop(0, frame_skip, lambda _, data: upstream.step(model, data), data)

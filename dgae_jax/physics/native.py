@@ -53,10 +53,7 @@ def _count_warnings(new: np.ndarray) -> None:
     for i in np.flatnonzero(new).tolist():
         kind = mujoco.mjtWarning(i).name.removeprefix("mjWARN_")
         if kind not in WARNING_COUNTS:
-            message = (
-                "MuJoCo warns of %s in physics native; more of this kind are counted, not shown"
-            )
-            _LOG.warning(message, kind)
+            _LOG.warning("MuJoCo warns of %s in physics native; more are only counted", kind)
         WARNING_COUNTS[kind] += int(new[i])
 
 

@@ -9,39 +9,12 @@ from typing import TYPE_CHECKING, NamedTuple
 if TYPE_CHECKING:
     import mujoco
 
-    from dgae_jax.physics.engine import EngineBuilder, Physics, Reads
-
-
-def _jax(spec: "mujoco.MjSpec", frame_skip: int, reads: "Reads") -> "Physics":
-    from dgae_jax.physics.jax.forward import jax_engine
-
-    return jax_engine(spec, frame_skip, reads)
-
-
-def _mjx(spec: "mujoco.MjSpec", frame_skip: int, reads: "Reads") -> "Physics":
-    from dgae_jax.physics.mjx import mjx
-
-    return mjx(spec, frame_skip, reads)
-
-
-def _mjx_warp(spec: "mujoco.MjSpec", frame_skip: int, reads: "Reads") -> "Physics":
-    from dgae_jax.physics.mjx import mjx_warp
-
-    return mjx_warp(spec, frame_skip, reads)
-
-
-def _native(spec: "mujoco.MjSpec", frame_skip: int, reads: "Reads") -> "Physics":
-    from dgae_jax.physics.native import native
-
-    return native(spec, frame_skip, reads)
+    from dgae_jax.physics.engine import Physics, Reads
 
 
 class Engine(NamedTuple):
     """An engine and its requirements."""
 
-    build: "EngineBuilder"
-    about: str
-    """One line for help texts."""
     on_host: bool = False
     """True if it simulates on the CPU whatever JAX's device is."""
     package: str | None = None
@@ -49,10 +22,10 @@ class Engine(NamedTuple):
 
 
 ENGINES = {
-    "jax": Engine(_jax, "MuJoCo's stages in our own JAX code, CPU or GPU"),
-    "mjx": Engine(_mjx, "google-deepmind's MuJoCo MJX, unchanged, any device"),
-    "mjx-warp": Engine(_mjx_warp, "MuJoCo MJX over MuJoCo Warp, NVIDIA GPUs", package="warp"),
-    "native": Engine(_native, "C MuJoCo, CPU", on_host=True),
+    "jax": Engine(),
+    "mjx": Engine(),
+    "mjx-warp": Engine(package="warp"),
+    "native": Engine(on_host=True),
 }
 
 
@@ -77,4 +50,12 @@ def make_physics(name: str, spec: "mujoco.MjSpec", frame_skip: int, reads: "Read
         ValueError: if the engine is unknown, not installed, or does not cover the model.
     """
     require(name)
-    return ENGINES[name].build(spec, frame_skip, reads)
+    if name == "jax":
+        from dgae_jax.physics.jax.forward import jax_engine as build
+    elif name == "native":
+        from dgae_jax.physics.native import native as build
+    elif name == "mjx":
+        from dgae_jax.physics.mjx import mjx as build
+    else:
+        from dgae_jax.physics.mjx import mjx_warp as build
+    return build(spec, frame_skip, reads)

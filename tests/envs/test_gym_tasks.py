@@ -69,7 +69,8 @@ def assert_steps_agree(ours, gym, poses, observation=1e-3, reward=1e-3):
 slow = pytest.mark.slow
 CASES = [
     *(("native", *case) for case in PLAIN),
-    *(("jax", name, "v5" if name == "ant" else "v4") for name in sorted(GYM_TASKS)),
+    ("jax", "swimmer", "v4"),
+    *(pytest.param("jax", name, "v5", marks=slow) for name in sorted(GYM_TASKS)),
 ]
 for engine, marks in (("mjx", [slow]), ("mjx-warp", [slow, WARP])):
     for case in PLAIN:
@@ -85,15 +86,8 @@ def test_one_step_agrees_with_gymnasium(physics, name, version):
     terms = sum(ours.metrics[term] for term in GYM_TASKS[name].TERMS)
     assert_allclose(ours.reward, terms, rtol=1e-5, atol=1e-5)
     assert_steps_agree(ours, gymnasium_task(name, version), visited(name))
-
-
-@pytest.mark.parametrize(
-    ("name", "low", "high"),
-    [("hopper", 0.1, 0.9), ("walker2d", 0.1, 0.9), ("ant", 0.001, 0.5), ("swimmer", -1, 0.001)],
-)
-def test_visited_steps_are_healthy_and_terminated(name, low, high):
-    steps = taken(dg.make_env(name, physics="native"), *visited(name))
-    assert low < float(steps.done.mean()) < high
+    assert bool(ours.done.any()) == (name != "swimmer")  # both kinds of steps are compared
+    assert not ours.done.all()
 
 
 NARROW = {
@@ -113,8 +107,14 @@ PARAMETERS = [
 ]
 
 
-@pytest.mark.parametrize("version", ["v4", "v5"])
-@pytest.mark.parametrize(("name", "parameters"), PARAMETERS)
+@pytest.mark.parametrize(
+    ("name", "parameters", "version"),
+    [
+        *((*case, version) for case in PARAMETERS for version in ("v4", "v5")),
+        ("ant", {"use_contact_forces": True}, "v4"),
+        ("ant", {"include_cfrc_ext_in_observation": False}, "v5"),
+    ],
+)
 def test_task_parameters_mean_the_same_in_gymnasium(name, parameters, version):
     poses = tuple(x[::8] for x in visited(name))
     env = dg.make_env(name, physics="native", version=version, **parameters)
@@ -122,17 +122,6 @@ def test_task_parameters_mean_the_same_in_gymnasium(name, parameters, version):
     ours = taken(env, *poses)
     assert ours.obs.shape[1:] == gym.observation_space.shape == (env.observation_size,)
     assert_steps_agree(ours, gym, poses, reward=3e-3)
-
-
-@pytest.mark.parametrize(
-    ("version", "parameters"),
-    [("v4", {"use_contact_forces": True}), ("v5", {"include_cfrc_ext_in_observation": False})],
-)
-def test_ant_observes_contact_forces_by_version_and_flag(version, parameters):
-    poses = tuple(x[::8] for x in visited("ant"))
-    env = dg.make_env("ant", physics="native", version=version, **parameters)
-    assert env.observation_size == (111 if version == "v4" else 27)
-    assert_steps_agree(taken(env, *poses), gymnasium_task("ant", version, **parameters), poses)
 
 
 @pytest.mark.parametrize(("name", "version"), PLAIN)
@@ -160,11 +149,10 @@ def test_control_cost_takes_the_action_as_given():
     assert_allclose(outside.metrics["reward_ctrl"], -1e-3 * 12)
 
 
-@pytest.mark.parametrize(
-    ("name", "scale"), [("hopper", 5e-3), ("walker2d", 5e-3), ("swimmer", 0.1), ("ant", 0.1)]
-)
-def test_resets_scatter_as_in_gymnasium(name, scale):
+@pytest.mark.parametrize("name", sorted(GYM_TASKS))
+def test_resets_scatter_as_in_gymnasium(name):
     env = dg.make_env(name, physics="native")
+    scale = env.reset_noise_scale
     states = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.key(0), 4_000)).pipeline_state
     position, velocity = np.asarray(states.qpos - env.physics.model.qpos0), np.asarray(states.qvel)
     assert np.abs(position).max() <= scale * (1 + 1e-3)

@@ -32,7 +32,7 @@ def roll_out(env, key, steps, limit=1000):
 
 @pytest.mark.parametrize(
     ("name", "steps", "limit"),
-    [("Pendulum-v1", 220, 1000), ("Pendulum-v1", 20, 15), ("InvertedPendulum-v5", 40, 1000)],
+    [("Pendulum-v1", 220, 1000), ("InvertedPendulum-v5", 40, 8)],
 )
 def test_rollout_equals_gymnasium_step_by_step(name, steps, limit, key):
     env = dg.make_env(f"gymnasium:{name}")
@@ -46,9 +46,8 @@ def test_rollout_equals_gymnasium_step_by_step(name, steps, limit, key):
         while not over:
             assert_array_equal(step.obs[t, i], np.float32(obs))
             space = gym.action_space
-            obs, reward, terminated, truncated, _ = gym.step(
-                np.clip(np.asarray(step.action[t, i]), space.low, space.high)
-            )
+            action = np.clip(np.asarray(step.action[t, i]), space.low, space.high)
+            obs, reward, terminated, truncated, _ = gym.step(action)
             assert_array_equal(step.next_obs[t, i], np.float32(obs))  # the true successor
             assert step.reward[t, i] == np.float32(reward)
             assert step.terminated[t, i] == terminated
@@ -63,9 +62,7 @@ def test_same_key_gives_same_numbers_again_and_vmapped(key):
     env = dg.make_env("gymnasium:Pendulum-v1")
     run = jax.jit(lambda key: roll_out(env, key, 210)[0])
     once, again = run(key), run(key)
-    both = jax.jit(jax.vmap(lambda key: roll_out(env, key, 210)[0]))(
-        jnp.stack([key, jax.random.key(1)])
-    )
+    both = jax.vmap(run)(jnp.stack([key, jax.random.key(1)]))
     jax.tree.map(lambda a, b, c: [assert_array_equal(x, a) for x in (b, c[0])], once, again, both)
     assert jnp.abs(both[1].obs[0] - both[1].obs[1]).max() > 0.1
 
@@ -94,12 +91,11 @@ def test_env_only_goes_forward(key):
     step(after, jnp.ones(1))
     with pytest.raises(jax.errors.JaxRuntimeError, match="only goes forward"):
         jax.block_until_ready(step(after, jnp.ones(1)))
-    assert_array_equal(
-        step(state, jnp.ones(1)).obs, after.obs
-    )  # the beginning of an episode can be gone back to
+    # the beginning of an episode can be gone back to
+    assert_array_equal(step(state, jnp.ones(1)).obs, after.obs)
 
 
-def test_the_worlds_of_an_environment_are_closed_with_it(key):
+def test_gymnasium_envs_are_closed_with_their_task(key):
     env = dg.make_env("gymnasium:Pendulum-v1")
     jax.block_until_ready(jax.jit(env.reset)(key))
     envs = weakref.ref(env._envs)
@@ -112,7 +108,6 @@ def test_the_worlds_of_an_environment_are_closed_with_it(key):
     ("name", "reason"),
     [
         ("CartPole-v1", r"its actions are Discrete\(2\), and must be a Box with one axis"),
-        ("FrozenLake-v1", r"its actions are Discrete\(4\)"),
         ("Nope-v1", "Gymnasium cannot make it: NameNotFound: Environment `Nope` doesn't exist"),
         ("nowhere:Nope-v1", "Gymnasium cannot make it: ModuleNotFoundError"),
     ],

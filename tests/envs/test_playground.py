@@ -58,9 +58,8 @@ def test_task_equals_playgrounds_own_with_truncation(key):
     assert step.mask.all()
     assert not step.terminated.any()
     assert_array_equal(np.flatnonzero(step.truncated), [999])
-    state, reset, advance = None, jax.jit(theirs.reset), jax.jit(theirs.step)
+    state, advance = jax.jit(theirs.reset)(key), jax.jit(theirs.step)
     for t in range(20):
-        state = reset(key) if state is None else state
         state = advance(state, step.action[t, 0])
         assert_allclose(step.next_obs[t, 0], state.obs, atol=1e-5)
         assert_allclose(step.reward[t, 0], state.reward, atol=1e-5)

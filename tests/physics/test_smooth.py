@@ -8,12 +8,12 @@ import pytest
 from numpy.testing import assert_allclose
 
 from dgae_jax.envs.gym_tasks import GYM_TASKS
-from dgae_jax.envs.task import load_spec
 from dgae_jax.physics.jax import math
 from dgae_jax.physics.jax.collision import collision, contact_groups
 from dgae_jax.physics.jax.constraint import make_constraint
-from dgae_jax.physics.jax.model import put_model, quat_to_mat
+from dgae_jax.physics.jax.model import put_model
 from dgae_jax.physics.jax.smooth import smooth
+from tests import parity
 
 # beyond the four tasks: anchors off the origin, springs, a body without joints, any orientation
 SPRINGY = """
@@ -32,7 +32,7 @@ SPRINGY = """
 def model_of(name):
     if name == "springy":
         return mujoco.MjModel.from_xml_string(SPRINGY)
-    return load_spec(GYM_TASKS[name].FILE["v4"]).compile()
+    return parity.model_of(name)
 
 
 @functools.cache
@@ -94,18 +94,3 @@ def test_constraint_rows_are_mujocos(name):
         ours, theirs = (x[np.argsort(x @ mix)] for x in (ours, theirs))
         assert_allclose(ours, theirs, rtol=1e-7, atol=1e-8)
     assert seen > 10
-
-
-def test_rotations_are_mujocos():
-    rng = np.random.default_rng(0)
-    quats, vectors = rng.normal(size=(4, 30)), rng.normal(size=(3, 30))
-    quats /= np.linalg.norm(quats, axis=0)
-    vectors[:, 0] = 0
-    with jax.enable_x64(True):
-        got = math.quat_integrate(jnp.asarray(quats), jnp.asarray(vectors))
-        matrices = math.quat_to_mat(jnp.asarray(quats))
-    for i in range(30):
-        want = quats[:, i].copy()
-        mujoco.mju_quatIntegrate(want, vectors[:, i], 1.0)
-        assert_allclose(got[:, i], want, atol=1e-14)
-        assert_allclose(matrices[..., i], quat_to_mat(quats[:, i]), atol=1e-14)

@@ -42,32 +42,24 @@ class ContactParams(NamedTuple):
 class ContactGroup(NamedTuple):
     """Possible contacts that are found and kept in the same way."""
 
-    params: ContactParams
-    geom1: Geoms | None
-    """None for the ground, a plane."""
-    geom2: Geoms
-    plane: np.ndarray
-    """[K 4] normal and offset of the ground [1, m]; empty without."""
     dim: int
-    """1 without friction, else 3."""
+    params: ContactParams
+    geom1: Geoms | np.ndarray
+    """For the ground its planes [K 4]: normal and offset [1, m]."""
+    geom2: Geoms
     max_contacts: int
     """Number of contacts that are kept, the nearest ones."""
 
 
 class Contact(NamedTuple):
-    """Fields of `mjContact` of K contacts in N envs."""
+    """Fields of `mjContact` of K contacts in N envs, with two of the axes of its `frame`."""
 
     dim: int
     params: ContactParams
-    """Their constants, as arrays."""
     dist: Float[Array, "K N"]
-    """Distance of the surfaces [m]; negative: penetration."""
     pos: Float[Array, "K 3 N"]
-    """Midpoint between the surfaces [m]."""
     normal: Float[Array, "K 3 N"]
-    """First axis of `contact.frame`, from the first geom to the second."""
     tangent: Float[Array, "K 3 N"]
-    """Second axis of `contact.frame`; the third is their cross product."""
 
 
 def known_max_contacts(name: str, model: mujoco.MjModel) -> int | None:
@@ -123,12 +115,11 @@ def _group(
     dofs = np.concatenate([np.zeros((1, mj.nv)), m.body_dofs])[bodies]
     params = ContactParams(solver, friction, dofs[:, 1] - dofs[:, 0], bodies)
     if not ground:
-        plane = np.empty((0, 4))
-        return ContactGroup(params, _geoms(m, one), geom2, plane, dim, len(pairs))
+        return ContactGroup(dim, params, _geoms(m, one), geom2, len(pairs))
     normals = np.array([quat_to_mat(mj.geom_quat[g])[:, 2] for g in one])
-    plane = np.c_[normals, (normals * mj.geom_pos[one]).sum(1)]
+    planes = np.c_[normals, (normals * mj.geom_pos[one]).sum(1)]
     kept = min(len(pairs), len(pairs) if max_contacts is None else max_contacts)
-    return ContactGroup(params, None, geom2, plane, dim, kept)
+    return ContactGroup(dim, params, planes, geom2, kept)
 
 
 def _geoms(m: Model, geoms: np.ndarray) -> Geoms:
@@ -142,7 +133,9 @@ def _geoms(m: Model, geoms: np.ndarray) -> Geoms:
 def collision(groups: list[ContactGroup], frames: Float[Array, "F 3 4 N"]) -> list[Contact]:
     """Find the contacts of each group."""
     return [
-        _plane_capsule(g, frames) if g.geom1 is None else _capsule_capsule(g, frames)
+        _capsule_capsule(g, g.geom1, frames)
+        if isinstance(g.geom1, Geoms)
+        else _plane_capsule(g, g.geom1, frames)
         for g in groups
     ]
 
@@ -155,10 +148,10 @@ def _xpos(geoms: Geoms, frames: Array) -> tuple[Array, Array]:
     return center, matvec(mat, constant(geoms.half, frames.dtype))
 
 
-def _plane_capsule(group: ContactGroup, frames: Array) -> Contact:
+def _plane_capsule(group: ContactGroup, planes: np.ndarray, frames: Array) -> Contact:
     """Contacts of the ends of capsules, or of spheres, with the ground."""
     end, half = _xpos(group.geom2, frames)
-    plane = constant(group.plane, frames.dtype)
+    plane = constant(planes, frames.dtype)
     radius = constant(group.geom2.radius, frames.dtype)
     dist, normal = dot(end, plane[:, :3]) - plane[:, 3] - radius, plane[:, :3] + 0 * end
     pos = end - normal * (radius + 0.5 * dist)[:, None]
@@ -168,11 +161,10 @@ def _plane_capsule(group: ContactGroup, frames: Array) -> Contact:
     return _nearest(group, dist, pos, normal, tangent)
 
 
-def _capsule_capsule(group: ContactGroup, frames: Array) -> Contact:
+def _capsule_capsule(group: ContactGroup, geom1: Geoms, frames: Array) -> Contact:
     """Contacts at the nearest points of two segments, as MuJoCo finds them."""
-    assert group.geom1 is not None
     pos2, half2 = _xpos(group.geom2, frames)
-    pos1, half1 = _xpos(group.geom1, frames)
+    pos1, half1 = _xpos(geom1, frames)
     a, b, c = dot(half1, half1), -dot(half1, half2), dot(half2, half2)
     u, v = dot(half1, pos2 - pos1), dot(half2, pos1 - pos2)
     parallel, a, c = a * c - b * b <= 0, jnp.where(a > 0, a, 1), jnp.where(c > 0, c, 1)
@@ -181,7 +173,7 @@ def _capsule_capsule(group: ContactGroup, frames: Array) -> Contact:
     x1 = jnp.clip((u - b * x2) / a, -1, 1)
     start = pos1 + x1[:, None] * half1
     apart = pos2 + x2[:, None] * half2 - pos1 - x1[:, None] * half1
-    radius1, radius2 = (constant(g.radius, pos1.dtype) for g in (group.geom1, group.geom2))
+    radius1, radius2 = (constant(g.radius, pos1.dtype) for g in (geom1, group.geom2))
     dist, normal = jnp.sqrt(dot(apart, apart)) - (0 + radius1 + radius2), normalize(apart)
     pos = start + normal * (radius1 + 0.5 * dist)[:, None]
     return _nearest(group, dist, pos, normal, _any_tangent(normal))

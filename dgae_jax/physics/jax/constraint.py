@@ -19,14 +19,11 @@ from dgae_jax.physics.jax.smooth import Smooth
 
 
 class Constraint(NamedTuple):
-    """C constraint rows of N envs."""
+    """C constraint rows of N envs; `efc_J` is transposed."""
 
     efc_J: Float[Array, "V C N"]
-    """Jacobian, transposed."""
     efc_D: Float[Array, "C N"]
-    """Inverse of the regularization `efc_R`; zero for a row that is not active."""
     efc_aref: Float[Array, "C N"]
-    """Reference acceleration."""
 
 
 def make_constraint(

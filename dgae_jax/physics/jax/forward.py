@@ -50,7 +50,8 @@ def jax_engine(
         problem = solver.Problem(s.qM, s.qfrc_smooth, *constraint)
         solution = solver.solve(problem, qacc_warmstart)
         if reads.forces:
-            cfrc_ext = rne_postconstraint(m, contacts, s.subtree_com, solution.efc_force)
+            efc_force = -constraint.efc_D * jnp.minimum(solution.Jaref, 0)
+            cfrc_ext = rne_postconstraint(m, contacts, s.subtree_com, efc_force)
         return solution.qacc, (xpos, cfrc_ext)
 
     def rungekutta4(state: PhysicsState, ctrl: Array) -> PhysicsState:
@@ -74,10 +75,7 @@ def jax_engine(
 
     @jax.default_matmul_precision("highest")  # TF32 on GPUs is too coarse for dynamics
     def step(state: PhysicsState, ctrl: Array) -> PhysicsState:
-        def substep(state, _):
-            return rungekutta4(state, ctrl), None
-
-        return jax.lax.scan(substep, state, None, length=frame_skip)[0]
+        return jax.lax.fori_loop(0, frame_skip, lambda _, state: rungekutta4(state, ctrl), state)
 
     return Physics(model, single_env(_in_blocks(step)), "jax", reads)
 

@@ -23,11 +23,8 @@ class Smooth(NamedTuple):
     frames: Float[Array, "F 3 4 N"]
     """Rotation and position of each joint's frame: `xmat` and `xpos` of the body behind it."""
     subtree_com: Float[Array, "3 N"]
-    """Center of mass of the tree [m]."""
     cdof: Float[Array, "V 6 N"]
-    """Motion of the tree per unit of each velocity."""
     qM: Float[Array, "V V N"]
-    """Mass matrix, in full."""
     qfrc_smooth: Float[Array, "V N"]
     """Motors, springs, dampers, gravity, fluid and bias [N, N m]."""
 

@@ -30,14 +30,6 @@ class Problem(NamedTuple):
     efc_aref: Float[Array, "C N"]
 
 
-class Solution(NamedTuple):
-    """The optimum."""
-
-    qacc: Float[Array, "V N"]
-    efc_force: Float[Array, "C N"]
-    niter: Int[Array, " N"]
-
-
 class Context(NamedTuple):
     """Data updated during each Newton step; `gauss_grad` is M qacc − qfrc_smooth."""
 
@@ -48,7 +40,7 @@ class Context(NamedTuple):
     niter: Int[Array, " N"]
 
 
-def solve(p: Problem, qacc_warmstart: Float[Array, "V N"]) -> Solution:
+def solve(p: Problem, qacc_warmstart: Float[Array, "V N"]) -> Context:
     """Find the optimum from a warm start, in at most `ITERATIONS` Newton steps.
 
     All envs take the first step together. Those that need more take them in groups of a quarter on
@@ -83,8 +75,7 @@ def solve(p: Problem, qacc_warmstart: Float[Array, "V N"]) -> Solution:
     none = jnp.zeros(qacc_warmstart.shape[-1:], bool)
     start = Context(qacc_warmstart, Jaref, gauss_grad, none, none.astype(jnp.int32))
     ctx = _newton_step(p, start)
-    ctx = jax.lax.platform_dependent(p, ctx, cpu=in_groups, default=together)
-    return Solution(ctx.qacc, -p.efc_D * jnp.minimum(ctx.Jaref, 0), ctx.niter)
+    return jax.lax.platform_dependent(p, ctx, cpu=in_groups, default=together)
 
 
 def _newton_step(p: Problem, ctx: Context) -> Context:
