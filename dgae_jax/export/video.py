@@ -3,7 +3,7 @@
 import math
 from collections.abc import Iterable, Iterator
 from contextlib import ExitStack
-from itertools import zip_longest
+from itertools import islice, zip_longest
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -104,7 +104,7 @@ def play(actor: Actor, seed: int, seconds: float) -> Episode:
     dt = env.unwrapped.dt
     shown = min(config.episode_length, max(1, math.floor(seconds / dt)))
     most = shown + steps_that_count(config.gamma)
-    steps = list(gymnasium_steps([env], actor.policy, [seed], most, _pose))
+    steps = list(islice(gymnasium_steps([env], actor.policy, [seed], _pose), most))
     env.close()
     qpos, qvel = map(np.stack, zip(*(step.snapshots[0] for step in steps[:shown]), strict=True))
     rewards = np.concatenate([step.reward for step in steps])

@@ -23,7 +23,7 @@ from dgae_jax.maths.statistics import coverage, crps, pit
 from dgae_jax.maths.transport import quantile_huber_loss, quantile_midpoints
 from dgae_jax.run import checkpoint
 from dgae_jax.run.checkpoint import Networks
-from dgae_jax.run.episodes import sampled_steps
+from dgae_jax.run.episodes import SAMPLED_CHUNK, sampled_steps
 from dgae_jax.run.runtime import Watch, compile_in_thread, unwatched
 
 NEGLIGIBLE = 0.01
@@ -32,17 +32,14 @@ NEGLIGIBLE = 0.01
 MAX_RETURN_STEPS = 50_000
 """Most steps that a return is followed for."""
 
-NUM_ENVS = 64
-"""Envs side by side in a calibration."""
+NUM_ENVS, BINS = 64, 20
+"""Envs side by side in a calibration, and bins of its histogram."""
 
 SHARES = (SIMILAR, 0.03, 0.01, 0.003)
 """Shares of W₁ up to which |d| counts as that of similar means."""
 
-BINS = 20
-"""Bins of the histogram of the probability integral transform."""
-
 PASSES, LEARNING_RATE = 20, 1e-3
-"""Passes over all returns, and Adam's rate at the start, which decays to zero."""
+"""Passes of a refit over all returns, and Adam's rate at the start, which decays to zero."""
 
 KAPPA = 1e-4
 """κ of the quantile Huber loss in standard deviations; near 0 its minimizers are quantiles."""
@@ -74,24 +71,19 @@ def check_returns(config: ResolvedConfig) -> None:
 
 
 def monte_carlo(
-    policy: InferenceState,
-    config: ResolvedConfig,
-    key: Key[Array, ""],
-    num_envs: int,
-    watch: Watch = unwatched,
+    policy: InferenceState, config: ResolvedConfig, key: Key[Array, ""], num_envs: int, watch: Watch
 ) -> MonteCarlo:
     """Sample returns of a stochastic policy over `episode_length` steps, in whole chunks.
 
-    Each return is followed until further rewards do not count. Raises as `check_returns`.
+    Each return is followed until further rewards do not count.
     """
     check_returns(config)
     length = config.episode_length + steps_that_count(config.gamma)
-    seen, paid, done = [], [], 0
+    kept = -(-config.episode_length // SAMPLED_CHUNK)
+    seen, paid = [], []
     for step in sampled_steps(policy, config, key, num_envs, length, watch):
-        if done < config.episode_length:
-            seen.append(step.obs)
+        seen += [step.obs] if len(seen) < kept else []
         paid.append((step.reward, config.gamma * (1.0 - step.terminated)))
-        done += len(step.reward)
     obs = jnp.concatenate(seen)
     reward, discount = (jnp.concatenate(part) for part in zip(*paid, strict=True))
     returns = lambda_sum(reward, discount)
@@ -118,7 +110,8 @@ def calibrate(
         watch: told the progress.
 
     Returns:
-        `calibration_statistics`, of returns of scaled rewards, and `similar_mean_shares`.
+        `calibration_statistics`, of returns of scaled rewards. `similar_means` are shares of steps
+        [T − 1, N] with |d(r + γG′, G)| ≤ share · W₁(r + γG′, G), by share.
 
     Raises:
         ConfigError: as `check_returns`.
@@ -129,12 +122,11 @@ def calibrate(
     std = float(checkpoint.reward_std(found.path, config)[index])
     came = monte_carlo(policy, config, jax.random.key(seed), NUM_ENVS, watch)
     quantiles = jax.jit(make_quantiles(make_task(config), config))(critic, came.obs)
-    shares = similar_mean_shares(came.reward / std, came.discount, quantiles)
     return {
         "checkpoint": found.path.name,
         "samples": came.returns.size,
         **calibration_statistics(quantiles, came.returns / std),
-        "similar_means": shares,
+        "similar_means": similar_mean_shares(came.reward / std, came.discount, quantiles),
     }
 
 
@@ -157,8 +149,7 @@ def calibration_statistics(quantiles: jax.Array, returns: jax.Array) -> dict[str
         "spread": quantiles.std(-1).mean(),
         "crps": crps(quantiles, returns).mean(),
     }
-    probability = np.asarray(pit(quantiles, returns))
-    bins = np.histogram(probability, BINS, (0, 1))[0] / probability.size
+    bins = np.histogram(np.asarray(pit(quantiles, returns)), BINS, (0, 1))[0] / returns.size
     numbers = {name: round(float(value), 6) for name, value in found.items()}
     return {**numbers, "pit": [round(float(share), 6) for share in bins]}
 
@@ -166,14 +157,11 @@ def calibration_statistics(quantiles: jax.Array, returns: jax.Array) -> dict[str
 def similar_mean_shares(
     reward: jax.Array, discount: jax.Array, quantiles: jax.Array
 ) -> dict[str, float]:
-    """Return shares of steps [T − 1, N] with |d(r + γG′, G)| ≤ share · W₁(r + γG′, G)."""
+    """Return the share of steps with similar means before and after, by share of W₁."""
     before, after = quantiles[:-1], quantiles[1:]
-    target = bellman_target(reward[: len(before)], discount[: len(before)], after)
-
-    def portion(share: float) -> float:
-        return round(float(similar_means(target, before, share).mean()), 6)
-
-    return {str(share): portion(share) for share in SHARES}
+    target = bellman_target(reward[:-1], discount[:-1], after)
+    similar = {share: similar_means(target, before, share).mean() for share in SHARES}
+    return {str(share): round(float(mean), 6) for share, mean in similar.items()}
 
 
 class Samples(NamedTuple):
@@ -209,7 +197,6 @@ def refit(
     Quantile regression (Koenker & Bassett 1978) without bootstrapping. Returns are scaled by
     their standard deviation. Arguments and errors as `calibrate`.
     """
-    check_returns(config)
     found = checkpoint.load_networks(source, config, which)
     policy = jax.tree.map(lambda x: x[index], found.policy)
     play_key, fit_key = jax.random.split(jax.random.key(seed))  # not the episodes of `calibrate`
@@ -218,25 +205,16 @@ def refit(
     std = jnp.where(spread > 0, spread, 1.0)
     obs = normalize(policy.obs_stats, came.obs).reshape(came.returns.size, -1)
     samples = Samples(obs, (came.returns / std).ravel())
-    config = _refitted_config(config, index)
+    written = config.as_config()
+    kept = {name: getattr(written.critic, name) for name in ("quantiles", "target")}
+    critic = CriticConfig(kind="sorted", hidden=config.critic.hidden, **kept)
+    one = {"seed": config.seed + index, "num_seeds": 1}
+    config = resolve(written.replace(**one, normalize_rewards=True, critic=critic))
     network = initial_network(samples, config.critic.outputs, config.critic.hidden)
     params = fit_quantiles(network, samples, len(came.returns), fit_key, watch)
     states = policy, InferenceState(params, policy.obs_stats)
     policy, critic = jax.tree.map(lambda x: x[None], states)
     return Refitted(config, Networks(policy, critic, found.path), std[None], came.returns.size)
-
-
-def _refitted_config(config: ResolvedConfig, index: int) -> ResolvedConfig:
-    """Return the configuration of one seed, with a `sorted` critic of scaled rewards."""
-    written = config.as_config()
-    critic = CriticConfig(
-        kind="sorted",
-        hidden=config.critic.hidden,
-        quantiles=written.critic.quantiles,
-        target=written.critic.target,
-    )
-    one = {"seed": config.seed + index, "num_seeds": 1}
-    return resolve(written.replace(**one, normalize_rewards=True, critic=critic))
 
 
 def initial_network(samples: Samples, quantiles: int, hidden: Sequence[int]) -> Network:
@@ -254,14 +232,8 @@ def fit_quantiles(
 ) -> Params:
     """Fit the network's outputs to quantiles of the samples, in `PASSES` over them.
 
-    The outputs are not sorted during the fit: as good, in half the time.
-
-    Args:
-        network: the network.
-        samples: what to fit.
-        minibatches: gradient steps per pass.
-        key: random key.
-        watch: told the progress.
+    The outputs are not sorted during the fit: as good, in half the time. `minibatches` is the
+    number of gradient steps per pass.
     """
 
     def loss(params: Params, batch: Any):

@@ -29,26 +29,20 @@ from dgae_jax.run.metrics import EvaluationsFile
 
 T = TypeVar("T")
 
-SCHEMA = 4
-"""Version of the file format."""
+SCHEMA, READABLE = 4, (3, 4)
+"""Version of the file format that is written, and those that are read."""
 
-RENAMED = {3: {"observations": "obs_stats"}}
-"""By schema: the old first part of an array's name, and the one in the next schema."""
+RENAMED = r"^observations\b"
+"""Names in schema 3 of what is `obs_stats` now."""
 
-UNREADABLE = {
-    1: "what it calls physics mjx is now called jax",
-    2: "its envs drew random numbers in another way",
-}
-"""Schemas that are refused, and why."""
+SCALE = "reward_scale.returns.std"
+"""Name of the array that rewards are divided by."""
 
 ARRAY = 1
 """Msgpack's extension type of an array: shape, name of the dtype and bytes, as Flax writes it."""
 
 MAX_ARRAYS = 10_000
 """Most arrays in a file; containers that are larger are refused before they take memory."""
-
-WHICH = ("latest", "best")
-"""Choices of a checkpoint: the latest whole one, or that of the best evaluation."""
 
 
 class CheckpointError(ConfigError):
@@ -57,10 +51,6 @@ class CheckpointError(ConfigError):
 
 class DamagedError(CheckpointError):
     """A checkpoint with other bytes than were written; an older one may be whole."""
-
-
-class MissingError(CheckpointError):
-    """A checkpoint without an array that is looked for."""
 
 
 class NotFiniteError(CheckpointError):
@@ -88,19 +78,10 @@ def save(
     keep: int = 3,
     best: int | None = None,
 ) -> Path:
-    """Write `steps_….msgpack` atomically and delete old checkpoints.
+    """Write `steps_….msgpack` atomically, unless a number is not finite, and delete old ones.
 
-    Args:
-        directory: where the checkpoints are.
-        config: the run.
-        arrays: the training state, from `arrays_of`.
-        steps: samples of each run so far. Files of more steps do not count: the run went back
-            behind them because they were damaged.
-        keep: how many of the latest files stay.
-        best: steps of the best evaluation; its file stays too.
-
-    Raises:
-        NotFiniteError: a number is not finite; nothing is written.
+    The latest `keep` files up to `steps` stay, and that of the best evaluation. Later files are
+    damaged: the run went back behind them.
     """
     for name in not_finite(arrays):
         raise NotFiniteError(f"{name} is not finite after {steps:,} samples")
@@ -144,50 +125,34 @@ def not_finite(arrays: dict[str, np.ndarray]) -> list[str]:
     Networks, optimizers and running statistics must be finite. Envs (`episodes`) need not: the
     last return is NaN before the first, and an env may be kept for replay as it turned non-finite.
     """
-
-    def must_be_finite(name: str, x: np.ndarray) -> bool:
-        return jnp.issubdtype(x.dtype, jnp.inexact) and not name.startswith("episodes.")
-
-    checked = (name for name, x in arrays.items() if must_be_finite(name, x))
-    return [name for name in checked if not np.isfinite(arrays[name]).all()]
+    checked = {name: x for name, x in arrays.items() if not name.startswith("episodes.")}
+    inexact = [name for name, x in checked.items() if jnp.issubdtype(x.dtype, jnp.inexact)]
+    return [name for name in inexact if not np.isfinite(arrays[name]).all()]
 
 
 def config_of(path: Path) -> ResolvedConfig:
     """Return the configuration in a checkpoint; raises as `load`."""
-    _, _, text = _read(path)
-    try:
-        return resolve(from_dict(json.loads(text)))
-    except ConfigError as reason:
-        raise CheckpointError(f"{path}: is of another version ({reason})") from reason
-    except (ValueError, TypeError, RecursionError) as reason:
-        raise DamagedError(f"{path}: is damaged (no configuration)") from reason
+    _, text = _read(path)
+    with _decoding(path):
+        try:
+            return resolve(from_dict(json.loads(text)))
+        except ConfigError as reason:
+            raise CheckpointError(f"{path}: is of another version ({reason})") from reason
 
 
-def load(path: Path, like: T, *, part: bool = False) -> T:
-    """Return the tree of arrays saved at `path`.
-
-    Args:
-        path: a checkpoint or policy file.
-        like: the same tree of anything with shape and dtype, which the arrays must have.
-        part: the file may hold more than `like`.
+def load(path: Path, like: T) -> T:
+    """Return the arrays in a checkpoint or policy file, which may hold more, as a tree like `like`.
 
     Raises:
         DamagedError: the file cannot be read whole.
-        MissingError: an array is missing.
-        CheckpointError: an array is unknown, or of another type or shape.
+        CheckpointError: an array is missing, or of another type or shape.
         NotFiniteError: there is a NaN or infinity where `not_finite` allows none.
     """
     want = jax.eval_shape(_by_name, like)
-    schema, packed, _ = _read(path)
-    got = {}
-    for old_name, value in packed.items():
-        name = _current_name(old_name, schema)
-        if name in want:
-            got[name] = _array(path, name, value, want[name])
-        elif not part:
-            raise CheckpointError(f"{path}: is of another run, {name[:200]} is unknown here")
-    for name in sorted(set(want) - set(got)):
-        raise MissingError(f"{path}: is of another run, {name} is missing")
+    packed, _ = _read(path)
+    for name in sorted(want.keys() - packed.keys()):
+        raise CheckpointError(f"{path}: is of another run, {name} is missing")
+    got = {name: _array(path, name, packed[name], x) for name, x in want.items()}
     for name in not_finite(got):
         raise NotFiniteError(f"{path}: {name} is not finite, so it cannot be used")
 
@@ -198,43 +163,21 @@ def load(path: Path, like: T, *, part: bool = False) -> T:
     return jax.tree.map_with_path(restored, like)
 
 
-def _read(path: Path) -> tuple[int, dict[str, Any], str]:
-    """Check the checksum and return schema, packed arrays and configuration."""
-    try:
-        data = path.read_bytes()
-    except OSError as reason:
-        raise DamagedError(f"{path}: cannot be read ({reason.strerror})") from reason
-    end = data.find(b"\n")
-    schema, checksum = _header(path, data[: max(end, 0)])
-    body = memoryview(data)[end + 1 :]
-    if hashlib.sha256(body).hexdigest() != checksum:
-        raise DamagedError(f"{path}: is damaged (its checksum differs)")
+def _read(path: Path) -> tuple[dict[str, Any], str]:
+    """Check the checksum and return packed arrays by name, and the configuration."""
     with _decoding(path):
-        found: Any = msgpack.unpackb(body, max_array_len=0, max_map_len=MAX_ARRAYS)
-        if list(found) != ["arrays", "config"] or not all(type(x) is str for x in found["arrays"]):
-            raise ValueError
-        return schema, found["arrays"], found["config"]
-
-
-def _header(path: Path, line: bytes) -> tuple[int, str]:
-    try:
+        line, _, body = path.read_bytes().partition(b"\n")
         header = json.loads(line)
         schema, checksum = header["schema"], header["sha256"]
-    except (ValueError, TypeError, KeyError, RecursionError):
-        raise DamagedError(f"{path}: is damaged (no header)") from None
-    if type(schema) is not int:
-        raise DamagedError(f"{path}: is damaged (no schema)")
-    if schema not in (*RENAMED, SCHEMA):
-        why = UNREADABLE.get(schema, "it is of a newer version")
-        raise CheckpointError(f"{path}: has schema {schema}, must be at most {SCHEMA}: {why}")
-    return schema, checksum
-
-
-def _current_name(name: str, schema: int) -> str:
-    first, dot, rest = name.partition(".")
-    for version in range(schema, SCHEMA):
-        first = RENAMED[version].get(first, first)
-    return first + dot + rest
+        if type(schema) is not int:
+            raise ValueError
+        if schema not in READABLE:
+            raise CheckpointError(f"{path}: has schema {schema}, must be 3 or {SCHEMA}")
+        if hashlib.sha256(body).hexdigest() != checksum:
+            raise DamagedError(f"{path}: is damaged (its checksum differs)")
+        found: Any = msgpack.unpackb(body, max_array_len=0, max_map_len=MAX_ARRAYS)
+        packed = {re.sub(RENAMED, "obs_stats", name): x for name, x in found["arrays"].items()}
+        return packed, found["config"]
 
 
 def _array(path: Path, name: str, packed: Any, like: Any) -> np.ndarray:
@@ -243,12 +186,9 @@ def _array(path: Path, name: str, packed: Any, like: Any) -> np.ndarray:
         if packed.code != ARRAY:
             raise ValueError
         shape, dtype, data = msgpack.unpackb(packed.data, max_array_len=32, max_map_len=0)
-        if not all(type(n) is int for n in shape) or not isinstance(dtype, str):
-            raise ValueError
-    if (tuple(shape), dtype) != (like.shape, like.dtype.name):
-        found, here = f"{dtype[:20]}{tuple(shape)}", f"{like.dtype}{like.shape}"
-        raise CheckpointError(f"{path}: is of another run, {name} is {found}, here {here}")
-    with _decoding(path):
+        if (tuple(shape), dtype) != (like.shape, like.dtype.name):
+            found, here = f"{dtype}{tuple(shape)}"[:100], f"{like.dtype}{like.shape}"
+            raise CheckpointError(f"{path}: is of another run, {name} is {found}, here {here}")
         return np.frombuffer(data, like.dtype).reshape(like.shape)
 
 
@@ -257,6 +197,10 @@ def _decoding(path: Path) -> Iterator[None]:
     """Refuse a file that cannot be decoded; a hostile one makes the decoder raise many kinds."""
     try:
         yield
+    except CheckpointError:
+        raise
+    except OSError as reason:
+        raise DamagedError(f"{path}: cannot be read ({reason.strerror})") from reason
     except Exception as reason:
         raise DamagedError(f"{path}: is damaged ({type(reason).__name__})") from reason
 
@@ -276,22 +220,14 @@ def _name(path) -> str:
 
 
 def latest_train_state(run_dir: Path, config: ResolvedConfig) -> tuple[TrainState, Path]:
-    """Return the latest whole checkpoint and its file; warn of damaged ones.
-
-    Raises:
-        CheckpointError: there is none, or it is of another run than `config`.
-    """
-    return _latest(run_dir, partial(load_train_state, config=config))
+    """Return the latest whole checkpoint and its file; raise CheckpointError if there is none."""
+    return next(_readable(run_dir, lambda path: (load_train_state(path, config), path)))
 
 
 def load_train_state(path: Path, config: ResolvedConfig) -> TrainState:
     """Return the training state in one file; raises as `load`."""
     _check_run(path, config)
-    state = load(path, _abstract_state(config))
-    for iteration in state.iteration:
-        if path.name != file_name(int(iteration) * config.samples_per_iteration):
-            raise CheckpointError(f"{path}: is renamed, it was saved after {iteration} iterations")
-    return state
+    return load(path, _abstract_state(config))
 
 
 def load_networks(source: Path, config: ResolvedConfig, which: str) -> Networks:
@@ -299,33 +235,25 @@ def load_networks(source: Path, config: ResolvedConfig, which: str) -> Networks:
 
     Raises:
         ConfigError: the best is asked for and nothing was evaluated.
-        CheckpointError: as `latest_train_state`.
+        CheckpointError: there is no whole checkpoint, or it is of another run than `config`.
     """
-    if which not in WHICH:
-        raise invalid("checkpoint", which, f"one of {', '.join(WHICH)}")
+    if which not in ("latest", "best"):
+        raise invalid("checkpoint", which, "one of latest, best")
     if source.is_file():
         if which != "latest":
             raise invalid("checkpoint", which, f"latest: {source} is a single one")
         return _load_networks(source, config)
     if which == "latest":
-        return _latest(source, partial(_load_networks, config=config))[0]
+        return next(_readable(source, partial(_load_networks, config=config)))
     steps = EvaluationsFile(source / "evaluations.jsonl").best
     if steps is None:
         raise invalid("checkpoint", which, f"latest: {source} has no evaluations")
     return _load_networks(source / "checkpoints" / file_name(steps), config)
 
 
-def load_all_networks(run_dir: Path, config: ResolvedConfig) -> Iterator[Networks]:
-    """Yield the networks of every checkpoint, oldest first; warn of damaged ones.
-
-    Raises:
-        CheckpointError: there is none, or one is of another run than `config`.
-    """
-    for path in _some(run_dir):
-        try:
-            yield _load_networks(path, config)
-        except DamagedError as reason:
-            terminal.warn(f"warning: {reason}; skipped")
+def load_all_networks(run_dir: Path, config: ResolvedConfig) -> list[Networks]:
+    """Return the networks of every checkpoint, oldest first; raises as `latest_train_state`."""
+    return list(_readable(run_dir, partial(_load_networks, config=config)))[::-1]
 
 
 def reward_std(path: Path, config: ResolvedConfig) -> np.ndarray:
@@ -336,12 +264,10 @@ def reward_std(path: Path, config: ResolvedConfig) -> np.ndarray:
     """
     if not config.normalize_rewards:
         return np.ones(config.num_seeds)
-    part = _scale(_abstract_state(config).reward_scale.returns.std)
-    try:
-        return np.asarray(load(path, part, part=True)["reward_scale"]["returns"]["std"])
-    except MissingError:
+    if SCALE not in _read(path)[0]:
         hint = "dgae refit fits a critic that does"
-        raise CheckpointError(f"{path}: lacks the scale of rewards; {hint}") from None
+        raise CheckpointError(f"{path}: lacks the scale of rewards; {hint}")
+    return np.asarray(load(path, {SCALE: _abstract_state(config).reward_scale.returns.std})[SCALE])
 
 
 def reset_episodes(state: TrainState, config: ResolvedConfig) -> TrainState:
@@ -355,29 +281,18 @@ def reset_episodes(state: TrainState, config: ResolvedConfig) -> TrainState:
 
 def save_networks(path: Path, config: ResolvedConfig, networks: Networks, std: ArrayLike) -> None:
     """Write a policy file: networks and the scale of rewards, from `reward_std`."""
-    policy, critic, _ = networks
-    scale = _scale(jnp.asarray(std, jnp.float32)) if config.normalize_rewards else {}
-    parts = _networks(policy.params, critic.params, policy.obs_stats)
+    (policy, stats), (critic, _), _ = networks
+    parts = {"policy.params": policy, "critic.params": critic, "obs_stats": stats}
+    scale = {SCALE: jnp.asarray(std, jnp.float32)} if config.normalize_rewards else {}
     write(path, config, arrays_of(parts | scale))
-
-
-def _networks(policy: Any, critic: Any, obs_stats: Any) -> dict[str, Any]:
-    """Name the parts as a training state does."""
-    networks = {"policy": {"params": policy}, "critic": {"params": critic}}
-    return networks | {"obs_stats": obs_stats}
-
-
-def _scale(std: Any) -> dict[str, Any]:
-    return {"reward_scale": {"returns": {"std": std}}}
 
 
 def _load_networks(path: Path, config: ResolvedConfig) -> Networks:
     _check_run(path, config)
-    state: Any = _abstract_state(config)
-    part = _networks(state.policy.params, state.critic.params, state.obs_stats)
-    got = load(path, part, part=True)
-    policy = InferenceState(got["policy"]["params"], got["obs_stats"])
-    return Networks(policy, InferenceState(got["critic"]["params"], got["obs_stats"]), path)
+    policy, critic, stats, *_ = _abstract_state(config)
+    like = {"policy.params": policy.params, "critic.params": critic.params, "obs_stats": stats}
+    policy, critic, stats = map(load(path, like).get, like)
+    return Networks(InferenceState(policy, stats), InferenceState(critic, stats), path)
 
 
 def _check_run(path: Path, config: ResolvedConfig) -> None:
@@ -392,21 +307,16 @@ def _abstract_state(config: ResolvedConfig) -> TrainState:
     return jax.eval_shape(make_trainer(make_task(config), 1).init, config, seed_keys(config))
 
 
-def _latest(run_dir: Path, read: Callable[[Path], T]) -> tuple[T, Path]:
-    damaged = []
-    for path in reversed(_some(run_dir)):
+def _readable(run_dir: Path, read: Callable[[Path], T]) -> Iterator[T]:
+    """Read the checkpoints, latest first; warn of damaged ones, and refuse if there is no other."""
+    found = False
+    for path in reversed(checkpoints_in(run_dir / "checkpoints")):
         try:
             result = read(path)
         except DamagedError as reason:
-            damaged.append(str(reason))
+            terminal.warn(f"warning: {reason}; skipped")
             continue
-        for each in damaged:
-            terminal.warn(f"warning: {each}; falling back to {path.name}")
-        return result, path
-    raise CheckpointError("; ".join(damaged))
-
-
-def _some(run_dir: Path) -> list[Path]:
-    if paths := checkpoints_in(run_dir / "checkpoints"):
-        return paths
-    raise CheckpointError(f"{run_dir}: must hold a checkpoint; checkpoints/ has none")
+        found = True
+        yield result
+    if not found:
+        raise CheckpointError(f"{run_dir}: must hold a whole checkpoint; checkpoints/ has none")

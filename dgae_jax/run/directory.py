@@ -9,11 +9,10 @@ import fcntl
 import importlib.metadata
 import json
 import platform
-import stat
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
 from typing import IO, Any
@@ -30,8 +29,11 @@ VERSIONED = (
 )  # fmt: skip
 """Packages to record the versions of."""
 
-OWN_DIRECTORIES = ("checkpoints", "nonfinite", "tensorboard", "wandb", "mlflow")
-OWN_FILES = ("config.json", "manifest.json", "metrics.jsonl", "evaluations.jsonl", "sinks.json")
+OWN = (
+    "config.json", "manifest.json", "metrics.jsonl", "evaluations.jsonl", "sinks.json",
+    "checkpoints", "nonfinite", "tensorboard", "wandb", "mlflow",
+)  # fmt: skip
+"""Files and directories that may be no links or devices."""
 
 
 class InUseError(ConfigError):
@@ -46,19 +48,16 @@ def default_path(config: ResolvedConfig) -> Path:
 
 @contextlib.contextmanager
 def created(path: Path, config: ResolvedConfig, options: RunOptions) -> Iterator[None]:
-    """Make a new run directory and hold it.
+    """Make a new run directory and hold it; refuse one that holds anything else.
 
     `config.json` is written last: without it a directory counts as empty, and no run has begun.
-
-    Raises:
-        ConfigError: the directory holds anything else, or cannot be written.
     """
-    with _writing(path):
+    with _must_be("a directory that can be written", path):
         path.mkdir(parents=True, exist_ok=True)
         _check_empty(path)
     with locked(path):
         _check_empty(path)  # again: another process may have been quicker
-        with _writing(path):
+        with _must_be("a directory that can be written", path):
             (path / "checkpoints").mkdir(exist_ok=True)
             files.write_json(path / "manifest.json", {**_part(options), "resumed": []})
             write_config(path, config)
@@ -66,45 +65,35 @@ def created(path: Path, config: ResolvedConfig, options: RunOptions) -> Iterator
 
 
 @contextlib.contextmanager
-def _writing(path: Path) -> Iterator[None]:
+def _must_be(what: str, path: Path) -> Iterator[None]:
     try:
         yield
     except OSError as reason:
-        allowed = f"a directory that can be written ({reason.strerror})"
-        raise invalid("run_dir", path, allowed) from reason
+        raise ConfigError(f"{path}: must be {what} ({reason.strerror})") from reason
 
 
 def _check_empty(path: Path) -> None:
     """Refuse a directory that holds more than `created` leaves when it is killed."""
     left = {"manifest.json", "manifest.json.part", "config.json.part"}
     for each in path.iterdir():
-        unused = each.name == "metrics.jsonl" and not each.is_symlink() and not each.stat().st_size
-        empty = each.name == "checkpoints" and not each.is_symlink() and not any(each.iterdir())
+        unused = each.name == "metrics.jsonl" and not each.lstat().st_size
+        empty = each.name == "checkpoints" and not (each.is_symlink() or any(each.iterdir()))
         if not (each.name in left or unused or empty):
             raise invalid("run_dir", path, "a new or empty directory")
 
 
 def has_begun(path: Path) -> bool:
     """Return whether a run was made at `path`, so that it can be resumed."""
-    try:
+    with contextlib.suppress(OSError):  # a name that is too long, or an unreadable directory
         return (path / "config.json").exists()
-    except OSError:  # a name that is too long, or a directory that may not be read
-        return False
+    return False
 
 
 @contextlib.contextmanager
 def locked(path: Path) -> Iterator[None]:
-    """Hold the run directory, by its metrics; the lock ends with the process.
-
-    Raises:
-        InUseError: another process trains there.
-        ConfigError: the directory cannot be written.
-    """
-    try:
+    """Hold the run directory, by its metrics; the lock ends with the process."""
+    with _must_be("a directory that can be written", path):
         file = (path / "metrics.jsonl").open("a")
-    except OSError as reason:
-        must = f"must be a directory that can be written ({reason.strerror})"
-        raise ConfigError(f"{path}: {must}") from reason
     with file:
         hold(file, InUseError(f"{path}: must not be in use; another process is training there"))
         yield
@@ -122,12 +111,10 @@ def hold(file: IO, in_use: ConfigError) -> None:
 
 
 def config_of(source: Path) -> ResolvedConfig:
-    """Return the configuration of a run directory, or of a policy file, for which JAX is imported.
-
-    Raises:
-        ConfigError: `source` is neither.
-    """
-    if not _is(source, Path.is_file):
+    """Return the configuration of a run directory or policy file; raise ConfigError for others."""
+    with _must_be("a run directory or a policy file", source):
+        is_file = source.is_file()
+    if not is_file:
         return read_config(source)
     from dgae_jax.run import checkpoint
 
@@ -135,47 +122,22 @@ def config_of(source: Path) -> ResolvedConfig:
 
 
 def read_config(path: Path) -> ResolvedConfig:
-    """Return the configuration of a run directory.
-
-    Raises:
-        ConfigError: `path` is no run directory, or has links or devices in it.
-    """
-    if not _is(path, Path.is_dir):
-        there = "a file" if path.exists() else "nothing"
-        raise ConfigError(f"{path}: must be a run directory; there is {there} of that name")
-    for name in OWN_DIRECTORIES:
-        _check_own(path / name, "directory", stat.S_ISDIR)
-    with contextlib.suppress(OSError):  # what cannot be read is missed below
-        for file in [*(path / name for name in OWN_FILES), *path.glob("checkpoints/steps_*")]:
-            _check_own(file, "file", stat.S_ISREG)
+    """Return the configuration of a run directory; raise ConfigError if it has links or devices."""
+    with _must_be("a run directory", path):
+        if not path.is_dir():
+            there = "a file" if path.exists() else "nothing"
+            raise ConfigError(f"{path}: must be a run directory; there is {there} of that name")
+    with contextlib.suppress(OSError):  # what cannot be read is missed by those who need it
+        for own in [*(path / name for name in OWN), *path.glob("checkpoints/steps_*")]:
+            if own.is_symlink() or (own.exists() and not (own.is_file() or own.is_dir())):
+                raise ConfigError(f"{own}: must be in the run directory itself, not a link or pipe")
     return read_config_file(path / "config.json")
 
 
-def _is(path: Path, test: Callable[[Path], bool]) -> bool:
-    try:
-        return test(path)
-    except OSError as reason:
-        must = f"must be a run directory or a policy file ({reason.strerror})"
-        raise ConfigError(f"{path}: {must}") from reason
-
-
-def _check_own(part: Path, kind: str, is_kind: Callable[[int], bool]) -> None:
-    with contextlib.suppress(OSError):  # what is missing is missed by those who need it
-        if not is_kind(part.lstat().st_mode):
-            raise ConfigError(f"{part}: must be a {kind} in the run directory, not a link")
-
-
 def read_config_file(path: Path) -> ResolvedConfig:
-    """Return the configuration in a file of JSON.
-
-    Raises:
-        ConfigError: it cannot be read or is invalid.
-    """
-    try:
+    """Return the configuration in a file of JSON; raise ConfigError if there is none."""
+    with _must_be("a configuration that can be read", path):
         data = path.read_bytes()
-    except (OSError, ValueError) as reason:
-        why = getattr(reason, "strerror", reason)
-        raise ConfigError(f"{path}: must be a configuration that can be read ({why})") from reason
     try:
         return resolve(from_dict(json.loads(data)))
     except (ValueError, RecursionError) as reason:
@@ -189,9 +151,9 @@ def write_config(path: Path, config: ResolvedConfig) -> None:
 
 def extend_manifest(run_dir: Path, options: RunOptions) -> None:
     """Add the part that resumes a run to `manifest.json`."""
-    before = files.read_object(run_dir / "manifest.json")
-    parts = [*_resumed(before), _part(options)]
-    files.write_json(run_dir / "manifest.json", {**before, "resumed": parts})
+    before, parts = _parts(run_dir)
+    resumed = [*parts[1:], _part(options)]
+    files.write_json(run_dir / "manifest.json", {**before, "resumed": resumed})
 
 
 def saved_options(run_dir: Path) -> RunOptions:
@@ -208,22 +170,24 @@ def environment_changes(run_dir: Path, options: RunOptions) -> list[str]:
 
 def _environment(part: dict[str, Any]) -> dict[str, Any]:
     found = {name: part.get(name) for name in ("device", "cores", "processes", "git_revision")}
-    for table in (part.get("settings"), part.get("versions")):
-        found |= table if isinstance(table, dict) else {}
-    options = part.get("options")
-    return found | {"devices": options.get("devices") if isinstance(options, dict) else None}
+    settings, versions, options = (
+        table if isinstance(table := part.get(name), dict) else {}
+        for name in ("settings", "versions", "options")
+    )
+    return {**found, **settings, **versions, "devices": options.get("devices")}
 
 
 def last_part(run_dir: Path) -> dict[str, Any]:
     """Return the last part of the manifest; empty if it cannot be read."""
-    before = files.read_object(run_dir / "manifest.json")
-    part = (_resumed(before) or [before])[-1]
+    part = _parts(run_dir)[1][-1]
     return part if isinstance(part, dict) else {}
 
 
-def _resumed(manifest: dict[str, Any]) -> list[Any]:
-    found = manifest.get("resumed")
-    return found if isinstance(found, list) else []
+def _parts(run_dir: Path) -> tuple[dict[str, Any], list[Any]]:
+    """Return the manifest and its parts: itself, and those that resumed the run."""
+    manifest = files.read_object(run_dir / "manifest.json")
+    resumed = manifest.get("resumed")
+    return manifest, [manifest, *(resumed if isinstance(resumed, list) else [])]
 
 
 def _part(chosen: RunOptions) -> dict[str, Any]:
@@ -252,15 +216,13 @@ def _version(name: str) -> str | None:
 @cache
 def _git_revision() -> str | None:
     """Return the commit, `+` appended where files differ from it; None outside a checkout."""
-
-    def git(*words: str) -> str:
-        how: dict[str, Any] = {"cwd": Path(__file__).parent, "capture_output": True, "text": True}
-        # a busy machine takes its time, and None in a checkout would refuse a resume
-        return subprocess.run(["git", *words], check=True, timeout=60, **how).stdout.strip()
-
+    folder, file = Path(__file__).parent, Path(__file__).name
+    # a busy machine takes its time, and None in a checkout would refuse a resume
+    how: dict[str, Any] = {"cwd": folder, "capture_output": True, "text": True, "timeout": 60}
+    version = ["git", "describe", "--always", "--dirty=+", "--abbrev=40", "--exclude=*"]
     try:
-        git("ls-files", "--error-unmatch", Path(__file__).name)  # not a repository around it
-        differs = git("status", "--porcelain", "--untracked-files=no")
-        return git("rev-parse", "HEAD") + ("+" if differs else "")
+        # not of a repository around it
+        subprocess.run(["git", "ls-files", "--error-unmatch", file], check=True, **how)
+        return subprocess.run(version, check=True, **how).stdout.strip()
     except (OSError, subprocess.SubprocessError):
         return None

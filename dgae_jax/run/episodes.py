@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Bool, Float
 
 from dgae_jax.configs.resolved import ResolvedConfig
 from dgae_jax.envs.registry import CUSTOM_ENVS, spec_of
@@ -21,26 +22,23 @@ from dgae_jax.learn.parallel import Trainer
 from dgae_jax.learn.rollout import Episodes, rollout, start
 from dgae_jax.learn.types import InferenceState, Transition
 from dgae_jax.run.options import eval_env_id
-from dgae_jax.run.runtime import Watch, compile_in_thread, unwatched
+from dgae_jax.run.runtime import Watch, compile_in_thread
 
-CHUNK = 50
-"""Steps between looks at signals and clock."""
-
-SAMPLED_CHUNK = 100
-"""The same for episodes with sampled actions."""
+CHUNK, SAMPLED_CHUNK = 50, 100
+"""Steps between looks at signals and clock, with mean and with sampled actions."""
 
 
 class EvalStep(NamedTuple):
     """One step of E episodes side by side."""
 
-    obs: np.ndarray
-    """Observations before the step [E, O]."""
-    reward: np.ndarray
-    """Rewards [E], 0 where the episode has ended before."""
-    alive: np.ndarray
-    """False where an episode has ended, in this step or before [E]."""
-    terminated: np.ndarray
-    """True where an episode ended in this step other than by a time limit [E]."""
+    obs: Float[np.ndarray, "E O"]
+    """Observations before the step."""
+    reward: Float[np.ndarray, " E"]
+    """Rewards, 0 where the episode has ended before."""
+    alive: Bool[np.ndarray, " E"]
+    """False where the episode has ended, in this step or before."""
+    terminated: Bool[np.ndarray, " E"]
+    """True where the episode ended in this step other than by a time limit."""
     snapshots: list[Any]
     """What `snapshot` returned for each env before the step."""
 
@@ -82,18 +80,14 @@ def gymnasium_steps(
     envs: Sequence[Any],
     act: Callable[[np.ndarray], np.ndarray],
     seeds: Sequence[int] | np.ndarray,
-    steps: int | None = None,
     snapshot: Callable[[Any], Any] | None = None,
 ) -> Iterator[EvalStep]:
     """Play one episode per Gymnasium env, with one batched policy call per step.
 
-    The envs stay open.
-
     Args:
-        envs: one env per episode.
+        envs: one env per episode; they stay open.
         act: `act(obs [E, O]) -> action [E, A]`.
         seeds: the seed of each initial state.
-        steps: most steps; by default until all episodes have ended.
         snapshot: called with each env before each step, for example for its `qpos`.
 
     Yields:
@@ -101,8 +95,8 @@ def gymnasium_steps(
     """
     pairs = zip(envs, seeds, strict=True)
     obs = np.stack([env.reset(seed=int(seed))[0] for env, seed in pairs])
-    alive, step = np.full(len(envs), True), 0
-    while alive.any() and (steps is None or step < steps):
+    alive = np.full(len(envs), True)
+    while alive.any():
         before, actions = obs.copy(), act(obs.astype(np.float32))
         snapshots = [snapshot(env) for env in envs] if snapshot else []
         reward, over = np.zeros(len(envs)), np.full(len(envs), False)
@@ -110,7 +104,28 @@ def gymnasium_steps(
             obs[i], reward[i], over[i], truncated, _ = envs[i].step(actions[i])
             alive[i] = not (over[i] or truncated)
         yield EvalStep(before, reward, alive.copy(), over, snapshots)
-        step += 1
+
+
+class _Programs(NamedTuple):
+    act: Callable[[InferenceState, Any], jax.Array]
+    advance: Callable[[InferenceState, play.Play, int], play.Play]
+    trainer: Trainer
+
+
+@lru_cache(maxsize=1)
+def _programs(config: ResolvedConfig, custom: Any) -> _Programs:
+    """Return the programs of a run; `custom` is the object of a custom task."""
+    env = make_task(config)
+    greedy = make_greedy(env, config)
+
+    def advance(policy: InferenceState, now: play.Play, until: int) -> play.Play:
+        return play.play(env, lambda obs: greedy(policy, obs), now, until)
+
+    return _Programs(jax.jit(greedy), jax.jit(advance), make_trainer(env, 1))
+
+
+def _progress(step: int, config: ResolvedConfig, alive: int) -> str:
+    return f"step {step:,} of at most {config.episode_length:,}, {alive} still running"
 
 
 def gymnasium_returns(
@@ -118,15 +133,11 @@ def gymnasium_returns(
 ) -> np.ndarray:
     """Return undiscounted returns [E] of the mean action in Gymnasium, side by side."""
     envs = [make_eval_env(config) for _ in range(episodes)]
-    greedy = _greedy(config, CUSTOM_ENVS.get(config.env))
+    act = _programs(config, CUSTOM_ENVS.get(config.env)).act
     shape = (episodes, *envs[0].observation_space.shape)
-    compile_in_thread(greedy, policy, np.zeros(shape, np.float32), watch=watch)
-
-    def act(obs: np.ndarray) -> np.ndarray:
-        return np.asarray(greedy(policy, obs))
-
-    total = np.zeros(episodes)
-    steps = gymnasium_steps(envs, act, episode_seeds(seed, episodes))
+    compile_in_thread(act, policy, np.zeros(shape, np.float32), watch=watch)
+    total, seeds = np.zeros(episodes), episode_seeds(seed, episodes)
+    steps = gymnasium_steps(envs, lambda obs: np.asarray(act(policy, obs)), seeds)
     for number, step in enumerate(steps):
         total += step.reward
         if number % CHUNK == 0:
@@ -136,41 +147,17 @@ def gymnasium_returns(
     return total
 
 
-def _progress(step: int, config: ResolvedConfig, alive: int) -> str:
-    return f"step {step:,} of at most {config.episode_length:,}, {alive} still running"
-
-
-@lru_cache(maxsize=1)
-def _greedy(config: ResolvedConfig, given: Any):
-    """Compile the mean action; `given` is the object of a custom task."""
-    return jax.jit(make_greedy(make_task(config), config))
-
-
 def jax_returns(
     policy: InferenceState, config: ResolvedConfig, episodes: int, seed: int, watch: Watch
 ) -> np.ndarray:
     """Return undiscounted returns [E] of the mean action in the physics of `config`."""
-    trainer, advance = _programs(config, CUSTOM_ENVS.get(config.env))
-    envs = _fresh_envs(config, trainer, seed, episodes, watch)
-    now = play.begin(envs)
-    compile_in_thread(advance, policy, now, 1, watch=watch, what="compiling steps")
+    programs = _programs(config, CUSTOM_ENVS.get(config.env))
+    now = play.begin(_fresh_envs(config, programs.trainer, seed, episodes, watch))
+    compile_in_thread(programs.advance, policy, now, 1, watch=watch, what="compiling steps")
     while (step := int(now.step)) < config.episode_length and (alive := int(now.alive.sum())):
         watch(_progress(step, config, alive))
-        now = advance(policy, now, min(step + CHUNK, config.episode_length))
+        now = programs.advance(policy, now, min(step + CHUNK, config.episode_length))
     return np.asarray(now.total, np.float64)
-
-
-@lru_cache(maxsize=1)
-def _programs(
-    config: ResolvedConfig, given: Any
-) -> tuple[Trainer, Callable[[InferenceState, play.Play, int], play.Play]]:
-    env = make_task(config)
-    greedy = make_greedy(env, config)
-
-    def advance(policy: InferenceState, now: play.Play, until: int) -> play.Play:
-        return play.play(env, lambda obs: greedy(policy, obs), now, until)
-
-    return make_trainer(env, 1), jax.jit(advance)
 
 
 def _fresh_envs(
@@ -181,17 +168,17 @@ def _fresh_envs(
     They are taken from fresh training states, to share their program: a reset of Brax's takes half
     a minute to compile.
     """
-    batches = -(-episodes // (config.num_seeds * config.num_envs))
-    sequences = (np.random.SeedSequence((seed, i)) for i in range(batches))
+    size = config.num_seeds * config.num_envs
+    sequences = [np.random.SeedSequence((seed, i)) for i in range(-(-episodes // size))]
     numbers = [each.generate_state(config.num_seeds) for each in sequences]
     keys = [jnp.stack([jax.random.key(int(n)) for n in each]) for each in numbers]
     compile_in_thread(trainer.init, config, keys[0], watch=watch, what="compiling resets")
+    envs = [trainer.init(config, each).episodes.env for each in keys]
 
-    def flat(x: jax.Array) -> jax.Array:
-        return x.reshape(x.shape[0] * x.shape[1], *x.shape[2:])
+    def joined(*parts: jax.Array) -> jax.Array:
+        return jnp.concatenate([x.reshape(size, *x.shape[2:]) for x in parts])[:episodes]
 
-    envs = [jax.tree.map(flat, trainer.init(config, each).episodes.env) for each in keys]
-    return jax.tree.map(lambda *parts: jnp.concatenate(parts)[:episodes], *envs)
+    return jax.tree.map(joined, *envs)
 
 
 def sampled_steps(
@@ -200,38 +187,26 @@ def sampled_steps(
     key: jax.Array,
     num_envs: int,
     steps: int,
-    watch: Watch = unwatched,
+    watch: Watch,
 ) -> Iterator[Transition]:
-    """Sample actions in fresh envs without a time limit.
+    """Sample actions of one policy in fresh envs without a time limit.
 
-    Args:
-        policy: one policy, without an axis of seeds.
-        config: the run.
-        key: random key.
-        num_envs: number of envs.
-        steps: steps to take, rounded up to whole chunks.
-        watch: told the progress.
-
-    Yields:
-        Transitions [SAMPLED_CHUNK, num_envs].
+    Yields transitions [SAMPLED_CHUNK, num_envs], until at least `steps` were taken.
     """
     env = make_task(config)
     network = make_policy(env, config)
 
     @jax.jit
     @jax.default_matmul_precision("highest")  # as in training
-    def advance(
-        policy: InferenceState, episodes: Episodes, keys: jax.Array
-    ) -> tuple[Episodes, Transition]:
+    def advance(policy: InferenceState, episodes: Episodes, keys: jax.Array):
         return rollout(env, sampler(network, policy), episodes, keys, episode_length=2**30)
 
     begin, draw = jax.random.split(key)
     episodes = jax.jit(lambda keys: start(env, keys))(jax.random.split(begin, num_envs))
-    chunks = -(-steps // SAMPLED_CHUNK)
-    keys = jax.random.split(draw, (chunks, SAMPLED_CHUNK, num_envs))
+    total = -(-steps // SAMPLED_CHUNK) * SAMPLED_CHUNK
+    keys = jax.random.split(draw, (total // SAMPLED_CHUNK, SAMPLED_CHUNK, num_envs))
     compile_in_thread(advance, policy, episodes, keys[0], watch=watch)
-    for i in range(chunks):
-        done, total = i * SAMPLED_CHUNK, chunks * SAMPLED_CHUNK
-        watch(f"playing step {done:,} of {total:,} in {num_envs} envs")
-        episodes, step = advance(policy, episodes, keys[i])
+    for i, each in enumerate(keys):
+        watch(f"playing step {i * SAMPLED_CHUNK:,} of {total:,} in {num_envs} envs")
+        episodes, step = advance(policy, episodes, each)
         yield step

@@ -11,7 +11,8 @@ import numpy as np
 from dgae_jax.configs.resolved import ResolvedConfig
 from dgae_jax.learn.types import InferenceState
 from dgae_jax.maths.statistics import bootstrap_interval, iqm, sample_cvar
-from dgae_jax.run import checkpoint, episodes, files
+from dgae_jax.run import checkpoint, files
+from dgae_jax.run.episodes import gymnasium_returns, jax_returns
 from dgae_jax.run.options import engine_of, eval_env_id
 from dgae_jax.run.runtime import Watch, unwatched
 from dgae_jax.run.terminal import counted
@@ -24,19 +25,10 @@ def default_path(source: Path, engine: str, which: str) -> Path:
 
 
 def evaluate_run(
-    run_dir: Path,
-    config: ResolvedConfig,
-    *,
-    which: str,
-    engine: str | None = None,
-    episodes: int,
-    seed: int = 0,
-    watch: Watch = unwatched,
+    run_dir: Path, config: ResolvedConfig, *, which: str, **how: Any
 ) -> dict[str, Any]:
-    """Evaluate a run's latest or best checkpoint; see `evaluate_policies`."""
-    engine = engine_of(config, engine)
+    """Evaluate a run's latest or best checkpoint; `how` as in `evaluate_policies`."""
     found = checkpoint.load_networks(run_dir, config, which)
-    how: dict[str, Any] = {"engine": engine, "episodes": episodes, "seed": seed, "watch": watch}
     return {**evaluate_policies(found.policy, config, **how), "checkpoint": found.path.name}
 
 
@@ -65,40 +57,27 @@ def evaluate_policies(
     Raises:
         ConfigError: the engine is none of `engines_of`.
     """
-    engine = engine_of(config, engine)
-    returns = []
+    engine, env = engine_of(config, engine), eval_env_id(config)
+    in_gymnasium, returns = engine == "gymnasium", []
+    play = gymnasium_returns if in_gymnasium else jax_returns
+    played = config if in_gymnasium else dataclasses.replace(config, physics=engine)
     for i in range(config.num_seeds):
-        policy = jax.tree.map(lambda x, i=i: x[i], policies)
-        what = f"evaluating {counted(episodes, 'episode')} in {eval_env_id(config)} ({engine})"
+        what = f"evaluating {counted(episodes, 'episode')} in {env} ({engine})"
         what += f", seed {config.seed + i}" if config.num_seeds > 1 else ""
-        returns.append(_returns(policy, config, engine, episodes, seed, watch, what))
-    each = ({"seed": config.seed + i, **summary(x)} for i, x in enumerate(returns))
+
+        def progress(text: str, what: str = what) -> None:
+            watch(f"{what}: {text}")
+
+        policy = jax.tree.map(lambda x, i=i: x[i], policies)
+        returns.append(play(policy, played, episodes, seed, progress))
     return {
         "engine": engine,
-        "env": eval_env_id(config),
+        "env": env,
         "episodes": episodes * config.num_seeds,
         **summary(np.concatenate(returns)),
         **(seed_statistics(returns) if len(returns) > 1 else {}),
-        "seeds": list(each),
+        "seeds": [{"seed": config.seed + i, **summary(x)} for i, x in enumerate(returns)],
     }
-
-
-def _returns(
-    policy: InferenceState,
-    config: ResolvedConfig,
-    engine: str,
-    count: int,
-    seed: int,
-    watch: Watch,
-    what: str,
-) -> np.ndarray:
-    def progress(text: str) -> None:
-        watch(f"{what}: {text}")
-
-    if engine == "gymnasium":
-        return episodes.gymnasium_returns(policy, config, count, seed, progress)
-    config = dataclasses.replace(config, physics=engine)
-    return episodes.jax_returns(policy, config, count, seed, progress)
 
 
 @np.errstate(invalid="ignore")  # of a return that is not finite
@@ -115,11 +94,9 @@ def summary(returns: np.ndarray) -> dict[str, Any]:
 
 
 def seed_statistics(returns: list[np.ndarray]) -> dict[str, Any]:
-    """Return statistics of the mean returns of trained seeds.
+    """Return statistics of the mean returns of trained seeds: mean, std (n − 1) and IQM.
 
-    `seeds_std` is the sample standard deviation (n − 1); `interval` and `iqm_interval` are 95 %
-    percentile bootstrap intervals of the mean and the interquartile mean. With few seeds they are
-    too narrow.
+    The 95 % percentile bootstrap intervals are too narrow with few seeds.
     """
     means = np.array([each.mean() for each in returns])
     return {

@@ -1,7 +1,6 @@
 """Files that are written atomically, and files of JSON lines that grow."""
 
 import contextlib
-import errno
 import fcntl
 import json
 import math
@@ -22,19 +21,26 @@ def replace(path: Path, data: bytes) -> None:
                 file.flush()
                 os.fsync(file.fileno())
             part.replace(path)
-            sync_directory(path.parent)
         finally:
             part.unlink(missing_ok=True)
+        with _descriptor(path.parent) as directory, contextlib.suppress(OSError):
+            os.fsync(directory)  # or the rename may be lost; some network file systems cannot
 
 
 @contextlib.contextmanager
 def turn(directory: Path) -> Iterator[None]:
     """Let one process at a time write the files in a directory, where there are locks."""
-    descriptor = os.open(directory, os.O_RDONLY)
-    try:
+    with _descriptor(directory) as descriptor:
         with contextlib.suppress(OSError):  # some network file systems have none
             fcntl.flock(descriptor, fcntl.LOCK_EX)
         yield
+
+
+@contextlib.contextmanager
+def _descriptor(directory: Path) -> Iterator[int]:
+    descriptor = os.open(directory, os.O_RDONLY)
+    try:
+        yield descriptor
     finally:
         os.close(descriptor)
 
@@ -42,18 +48,6 @@ def turn(directory: Path) -> Iterator[None]:
 def beside(source: Path, name: str) -> Path:
     """Return where to write what is made of a run directory, or of a policy file."""
     return source.with_name(f"{source.stem}-{name}") if source.is_file() else source / name
-
-
-def sync_directory(path: Path) -> None:
-    """Flush the names in a directory to the disk, without which a rename may be lost."""
-    descriptor = os.open(path, os.O_RDONLY)
-    try:
-        os.fsync(descriptor)
-    except OSError as reason:
-        if reason.errno not in (errno.EINVAL, errno.ENOTSUP):  # some network file systems cannot
-            raise
-    finally:
-        os.close(descriptor)
 
 
 def write_json(path: Path, data: Any) -> None:
@@ -91,10 +85,10 @@ def append_rows(path: Path, rows: Iterable[dict[str, Any]]) -> None:
         os.fsync(file.fileno())
 
 
-def whole_rows(path: Path) -> Iterator[tuple[dict[str, Any], int]]:
-    """Yield each row of a file of JSON lines and its end offset, up to the first damaged line."""
-    end = 0
+def whole_rows(path: Path, end: int = 0) -> Iterator[tuple[dict[str, Any], int]]:
+    """Yield each row of JSON lines behind the offset `end`, and its end, up to a damaged line."""
     with path.open("rb") as file:
+        file.seek(end)
         for line in file:
             end += len(line)
             try:

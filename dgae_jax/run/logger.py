@@ -70,7 +70,7 @@ class RunLogger:
     def append(self, state: TrainState, measured: dict[str, Any], count: int) -> float | None:
         """Add `count` iterations to the metrics and return the last mean return, if any."""
         rows = self.metrics.append(measured, count, time.monotonic() - self.began)
-        self.feed.log("rows", rows)
+        self.feed.update()
         if self.options.debug_nonfinite:
             for seed in sorted({row["seed"] for row in rows if row["nonfinite"]}):
                 self._save_incidents(state, seed)
@@ -91,8 +91,7 @@ class RunLogger:
         if not self.evaluated:
             self.pending.result()  # the checkpoint is on the disk before its evaluation
             self.evaluations.append(self.steps, result)
-            rows = [{"steps": self.steps, **one} for one in result["seeds"]]
-            self.feed.log("evaluations", rows)
+            self.feed.update()
         self.draw()
         return result
 

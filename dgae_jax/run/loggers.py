@@ -1,31 +1,26 @@
 """Metric loggers: TensorBoard, Weights & Biases and MLflow, one of their runs per seed.
 
-`sinks.json` in the run directory says how far each has come: after a resume a logger gets the rows
-that it lacks, and none twice. A logger that fails costs one warning.
+A thread passes on the rows of `metrics.jsonl` and `evaluations.jsonl` that a logger lacks, at the
+start, after each dispatch and at the end. `sinks.json` says how far each logger has come. A logger
+that fails costs one warning.
 """
 
 import contextvars
 import dataclasses
-import itertools
-import math
 import os
 import secrets
-import socket
-import struct
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol
-from urllib.parse import unquote, urlsplit
 
 from dgae_jax.configs.resolved import ResolvedConfig
 from dgae_jax.configs.serial import flat, to_dict
 from dgae_jax.run import files, terminal
-from dgae_jax.run.metrics import EvaluationsFile
 
-ITERATIONS = 256
-"""Most iterations that are read at once."""
+FILES = {"rows": "metrics.jsonl", "evaluations": "evaluations.jsonl"}
+"""Files of the run directory that are logged, by their names in `sinks.json`."""
 
 MEDIA = ("curve.png", "video.mp4", "video.gif")
 """Files of the run directory that loggers get at the end."""
@@ -38,33 +33,21 @@ MLFLOW_BATCH = 1000
 
 
 class Place(NamedTuple):
-    """A run directory, its configuration, and how far a logger has come."""
+    """One seed of a run directory, and how far a logger has come."""
 
     run_dir: Path
-    config: ResolvedConfig
-    ids: dict[str, str]
-    """Ids of the logger's runs by seed; empty at first, kept in the run directory."""
+    name: str
+    seed: int
+    settings: dict[str, Any]
+    """The seed's configuration as far as it is set, by path."""
+    id: str | None
+    """The logger's id of its run, kept in the run directory; None at first."""
     steps: int
     """Samples up to which the logger has the metrics."""
 
-    @property
-    def seeds(self) -> range:
-        """The trained seeds."""
-        return range(self.config.seed, self.config.seed + self.config.num_seeds)
-
-    def name(self, seed: int) -> str:
-        """Return the name of the run of one seed."""
-        directory = self.run_dir.resolve().name
-        return directory if self.config.num_seeds == 1 else f"{directory}-seed-{seed}"
-
-    def hyperparameters(self, seed: int) -> dict[str, Any]:
-        """Return the set values of one seed's configuration by path."""
-        values = flat(to_dict(dataclasses.replace(self.config, seed=seed)))
-        return {path: value for path, value in values.items() if value is not None}
-
 
 class Entry(NamedTuple):
-    """The finite numbers of one row of `metrics.jsonl` or `evaluations.jsonl`."""
+    """The numbers of one row of `metrics.jsonl` or `evaluations.jsonl`."""
 
     seed: int
     steps: int
@@ -74,27 +57,15 @@ class Entry(NamedTuple):
 
 
 class MetricLogger(Protocol):
-    """A logger that is open for one run directory; what it raises gives the logger up."""
+    """A logger of one seed, opened with its `Place`; what it raises gives the logger up."""
+
+    id: str | None
 
     def log(self, entries: list[Entry]) -> None:
-        """Take entries in their order, of all seeds."""
+        """Take entries in the order of steps."""
 
     def close(self, paths: list[Path], finished: bool) -> None:
         """Take pictures and videos, and end; `finished` if the run reached its end."""
-
-
-def _entry(part: str, row: dict[str, Any]) -> Entry:
-    if part == "rows":
-        values = {name: x for name, x in row.items() if name not in ("steps", "seed")}
-    else:
-        values = {f"evaluation/{name}": row[name] for name in ("return_mean", "return_std")}
-    there = {k: float(x) for k, x in values.items() if x is not None and math.isfinite(x)}
-    return Entry(row["seed"], row["steps"], row.get("seconds"), there)
-
-
-def _batches(items: Iterable[Any], size: int) -> Iterator[list[Any]]:
-    left = iter(items)
-    return iter(lambda: list(itertools.islice(left, size)), [])
 
 
 class TensorBoard:
@@ -103,33 +74,27 @@ class TensorBoard:
     They are written synchronously: tensorboardX's `SummaryWriter` hangs when the disk is full.
     """
 
+    id: str | None = None
+
     def __init__(self, place: Place):
-        """Open a new event file per seed, which hides later steps of older ones."""
+        """Open a new event file, which hides later steps of older ones."""
         from tensorboardX.event_file_writer import EventsWriter
         from tensorboardX.proto.event_pb2 import SessionLog
         from tensorboardX.summary import text
 
-        self.writers = {}
-        for seed in place.seeds:
-            folder = place.run_dir / "tensorboard" / f"seed_{seed}"
-            folder.mkdir(parents=True, exist_ok=True)
-            number = f".{len(list(folder.iterdir()))}"  # a name of its own also within a second
-            self.writers[seed] = EventsWriter(str(folder / "events"), number)
-            start = SessionLog(status=SessionLog.START)
-            self._write(seed, step=place.steps + 1, session_log=start)
-            values = place.hyperparameters(seed).items()
-            table = ["| setting | value |", "|---|---|", *(f"| {k} | {v} |" for k, v in values)]
-            self._write(seed, summary=text("configuration", "\n".join(table)))
-        self._flush()
+        folder = place.run_dir / "tensorboard" / f"seed_{place.seed}"
+        folder.mkdir(parents=True, exist_ok=True)
+        number = f".{len(list(folder.iterdir()))}"  # a name of its own also within a second
+        self.writer = EventsWriter(str(folder / "events"), number)
+        self._write(step=place.steps + 1, session_log=SessionLog(status=SessionLog.START))
+        rows = [f"| {name} | {value} |" for name, value in place.settings.items()]
+        table = "\n".join(["| setting | value |", "|---|---|", *rows])
+        self._write(summary=text("configuration", table))
 
-    def _write(self, seed: int, **event) -> None:
+    def _write(self, **event) -> None:
         from tensorboardX.proto.event_pb2 import Event
 
-        self.writers[seed].write_event(Event(wall_time=time.time(), **event))
-
-    def _flush(self) -> None:
-        for writer in self.writers.values():
-            writer.flush()
+        self.writer.write_event(Event(wall_time=time.time(), **event))
 
     def log(self, entries: list[Entry]) -> None:
         """Write a scalar per number."""
@@ -137,23 +102,17 @@ class TensorBoard:
 
         for entry in entries:
             values = [Summary.Value(tag=k, simple_value=x) for k, x in entry.values.items()]
-            self._write(entry.seed, step=entry.steps, summary=Summary(value=values))
-        self._flush()
+            self._write(step=entry.steps, summary=Summary(value=values))
+        self.writer.flush()
 
     def close(self, paths: list[Path], finished: bool) -> None:
-        """Write the PNGs as they are, with the size in their header."""
-        from tensorboardX.proto.summary_pb2 import Summary
+        """Write the PNGs."""
+        from matplotlib.image import imread
+        from tensorboardX.summary import image
 
-        images = []
         for path in (path for path in paths if path.suffix == ".png"):
-            data = path.read_bytes()
-            width, height = struct.unpack(">II", data[16:24])
-            size: dict[str, Any] = {"width": width, "height": height, "colorspace": 4}
-            image = Summary.Image(encoded_image_string=data, **size)
-            images.append(Summary.Value(tag=path.name, image=image))
-        for seed, writer in self.writers.items():
-            self._write(seed, summary=Summary(value=images))
-            writer.close()
+            self._write(summary=image(path.name, imread(path), dataformats="HWC"))
+        self.writer.close()
 
 
 class WeightsAndBiases:
@@ -164,62 +123,58 @@ class WeightsAndBiases:
     """
 
     def __init__(self, place: Place):
-        """Start or continue the run of each seed."""
+        """Start or continue the run."""
         import wandb
 
-        mode, self.last, self.runs = _wandb_mode(), place.steps, {}
-        for seed in place.seeds:
-            run = self.runs[seed] = wandb.init(
-                dir=str(place.run_dir),
-                project=os.environ.get("WANDB_PROJECT") or "dgae_jax",
-                group=place.run_dir.resolve().name,
-                name=place.name(seed),
-                id=place.ids.setdefault(str(seed), secrets.token_hex(4)),
-                resume=None if mode == "offline" else "allow",
-                mode=mode,
-                reinit="create_new",
-                settings=wandb.Settings(silent=True, console="off"),
-            )
-            run.config.update(place.hyperparameters(seed), allow_val_change=True)
-            run.define_metric("*", step_metric="steps")
-            if mode == "online":
-                terminal.say(f"{place.name(seed)} at {run.url}")
+        mode, self.last = _wandb_mode(), place.steps
+        self.id: str | None = place.id or secrets.token_hex(4)
+        self.run = wandb.init(
+            dir=str(place.run_dir),
+            project=os.environ.get("WANDB_PROJECT") or "dgae_jax",
+            group=place.run_dir.resolve().name,
+            name=place.name,
+            id=self.id,
+            resume=None if mode == "offline" else "allow",
+            mode=mode,
+            reinit="create_new",
+            settings=wandb.Settings(silent=True, console="off"),
+        )
+        self.run.config.update(place.settings, allow_val_change=True)
+        self.run.define_metric("*", step_metric="steps")
+        if mode == "online":
+            terminal.say(f"{place.name} at {self.run.url}")
 
     def log(self, entries: list[Entry]) -> None:
         """Log the numbers over samples."""
         for entry in entries:
             self.last, evaluation = max(self.last, entry.steps), entry.seconds is None
             values = {"steps": entry.steps, **entry.values}
-            self.runs[entry.seed].log(values, step=2 * entry.steps + evaluation)
+            self.run.log(values, step=2 * entry.steps + evaluation)
 
     def close(self, paths: list[Path], finished: bool) -> None:
         """Log images and videos, and finish."""
         import wandb
 
-        for run in self.runs.values():
-            kinds = {path: wandb.Image if path.suffix == ".png" else wandb.Video for path in paths}
-            if media := {path.name: kind(str(path)) for path, kind in kinds.items()}:
-                run.log(media, step=2 * self.last + 2)
-            run.finish(exit_code=0 if finished else 1)
+        kinds = {path: wandb.Image if path.suffix == ".png" else wandb.Video for path in paths}
+        if media := {path.name: kind(str(path)) for path, kind in kinds.items()}:
+            self.run.log(media, step=2 * self.last + 2)
+        self.run.finish(exit_code=0 if finished else 1)
 
 
 def _wandb_mode() -> Any:
     """Return the user's mode; without one online if there is a login and a server: no prompts."""
+    import requests
     import wandb
-    from requests.utils import get_environ_proxies, get_netrc_auth, select_proxy
 
     chosen = wandb.setup().settings
     if os.environ.get("WANDB_MODE") or chosen.mode != "online":
         return chosen.mode
-    server = chosen.base_url
     keys = ("WANDB_API_KEY", "WANDB_IDENTITY_TOKEN_FILE")
-    if not (any(map(os.environ.get, keys)) or get_netrc_auth(server)):
+    if not (any(map(os.environ.get, keys)) or requests.utils.get_netrc_auth(chosen.base_url)):
         return "offline"
-    address = urlsplit(select_proxy(server, get_environ_proxies(server)) or server)
-    port = address.port or {"http": 80}.get(address.scheme, 443)
     try:
-        socket.create_connection((address.hostname, port), CONNECT_SECONDS).close()
-    except OSError:
+        requests.head(chosen.base_url, timeout=CONNECT_SECONDS)
+    except requests.RequestException:
         return "offline"
     return "online"
 
@@ -228,71 +183,51 @@ class MLflow:
     """A SQLite store in RUN_DIR/mlflow, or the server that MLFLOW_TRACKING_URI names.
 
     MLflow refuses to write its older store of plain files. The times of metrics are those of the
-    run, so that a row that is given twice is one.
+    run, so that a row that is given twice is one. Files are sent to a server only: the run
+    directory has them.
     """
 
     def __init__(self, place: Place):
-        """Start or continue the run of each seed."""
+        """Start or continue the run."""
         os.environ.setdefault("MLFLOW_DISABLE_TELEMETRY", "true")
         os.environ.setdefault("MLFLOW_LOGGING_LEVEL", "WARNING")
         from mlflow import MlflowClient
-
-        self.run_dir, self.server = place.run_dir, os.environ.get("MLFLOW_TRACKING_URI")
-        self.folder = (place.run_dir / "mlflow").resolve()
-        if not self.server:
-            self.folder.mkdir(exist_ok=True)
-        self.client = MlflowClient(self.server or f"sqlite:///{self.folder / 'mlflow.db'}")
-        self.runs = {seed: self._run(place, seed) for seed in place.seeds}
-        for run in self.runs.values():
-            self._keep(run, [place.run_dir / "config.json"])
-
-    def _run(self, place: Place, seed: int):
         from mlflow.entities import Param
 
-        known = place.ids.get(str(seed))
-        if known:
-            self.client.update_run(known, status="RUNNING")
+        self.server, folder = os.environ.get("MLFLOW_TRACKING_URI"), place.run_dir / "mlflow"
+        if not self.server:
+            folder.mkdir(exist_ok=True)
+        self.client = MlflowClient(self.server or f"sqlite:///{folder.resolve() / 'mlflow.db'}")
+        self.id: Any = place.id
+        if self.id:
+            self.client.update_run(self.id, status="RUNNING")
         else:
-            run = self.client.create_run(self._experiment(), run_name=place.name(seed))
-            place.ids[str(seed)] = known = run.info.run_id
-            pairs = place.hyperparameters(seed).items()
-            self.client.log_batch(known, params=[Param(name, str(x)) for name, x in pairs])
-        return self.client.get_run(known)
-
-    def _experiment(self) -> str:
-        name = os.environ.get("MLFLOW_EXPERIMENT_NAME") or "dgae_jax"
-        if found := self.client.get_experiment_by_name(name):
-            return found.experiment_id
-        own = None if self.server else (self.folder / "files").as_uri()
-        return self.client.create_experiment(name, artifact_location=own)
+            name = os.environ.get("MLFLOW_EXPERIMENT_NAME") or "dgae_jax"
+            found = self.client.get_experiment_by_name(name)
+            experiment = found.experiment_id if found else self.client.create_experiment(name)
+            self.id = self.client.create_run(experiment, run_name=place.name).info.run_id
+            params = [Param(path, str(value)) for path, value in place.settings.items()]
+            self.client.log_batch(self.id, params=params)
+        self.began = self.client.get_run(self.id).info.start_time
 
     def log(self, entries: list[Entry]) -> None:
         """Log the numbers at the times of the run."""
         from mlflow.entities import Metric
 
-        for seed, run in self.runs.items():
-            metrics = []
-            for entry in (entry for entry in entries if entry.seed == seed):
-                past = None if entry.seconds is None else 1000 * entry.seconds
-                at = round(1000 * time.time() if past is None else run.info.start_time + past)
-                metrics += [Metric(k, x, at, entry.steps) for k, x in entry.values.items()]
-            for some in _batches(metrics, MLFLOW_BATCH):
-                self.client.log_batch(run.info.run_id, metrics=some, synchronous=True)
+        metrics = []
+        for entry in entries:
+            past = None if entry.seconds is None else self.began + 1000 * entry.seconds
+            at = round(1000 * time.time() if past is None else past)
+            metrics += [Metric(k, x, at, entry.steps) for k, x in entry.values.items()]
+        for i in range(0, len(metrics), MLFLOW_BATCH):
+            some = metrics[i : i + MLFLOW_BATCH]
+            self.client.log_batch(self.id, metrics=some, synchronous=True)
 
     def close(self, paths: list[Path], finished: bool) -> None:
-        """Keep the files and end the runs."""
-        for run in self.runs.values():
-            self._keep(run, paths)
-            status = "FINISHED" if finished else "KILLED"
-            self.client.set_terminated(run.info.run_id, status)
-
-    def _keep(self, run, paths: list[Path]) -> None:
-        """Log files, unless the store lies elsewhere since its directory was moved."""
-        kept = urlsplit(run.info.artifact_uri)
-        here = Path(unquote(kept.path)).is_relative_to(self.run_dir.resolve())
-        if kept.scheme != "file" or here:
-            for path in paths:
-                self.client.log_artifact(run.info.run_id, str(path))
+        """End the run."""
+        for path in paths if self.server else ():
+            self.client.log_artifact(self.id, str(path))
+        self.client.set_terminated(self.id, "FINISHED" if finished else "KILLED")
 
 
 LOGGERS: dict[str, Callable[[Place], MetricLogger]] = {
@@ -310,80 +245,82 @@ class LoggerFeed:
 
     def __init__(self, names: tuple[str, ...], run_dir: Path, config: ResolvedConfig, done: int):
         """Open the loggers; `done` are the samples of each run in its files so far."""
-        self.run_dir, self.config = run_dir, config
+        self.run_dir, self.config, self.done = run_dir, config, done
         self.path = run_dir / "sinks.json"
-        found = files.read_object(self.path) if names else {}
-        self.state = {name: _progress(found.get(name)) for name in LOGGERS if name in found}
-        self.open: dict[str, MetricLogger] = {}
+        self.state = files.read_object(self.path) if names else {}
+        self.open: dict[str, dict[int, MetricLogger]] = {name: {} for name in names}
+        self.known: dict[str, dict[str, Any]] = {}
+        """How far each logger had come when it was opened; `read` are offsets since then."""
+        self.read: dict[tuple[str, str], int] = {}
         self.thread, self.context = ThreadPoolExecutor(1, "loggers"), contextvars.copy_context()
-        for name in names:
-            self._later(self._try, name, self._open, done)
+        self.update()
 
-    def log(self, part: str, rows: list[dict[str, Any]]) -> None:
-        """Log `rows` of metrics, all seeds of each iteration, or `evaluations`."""
-        self._each(self._give, part, rows)
+    def update(self) -> None:
+        """Log the rows that the run's files have by now."""
+        self._each(self._catch_up)
 
     def close(self, finished: bool) -> None:
         """Wait until all is written; `finished` if the run reached its end."""
         self._each(self._close, finished)
         self.thread.shutdown()
 
-    def _each(self, work: Callable[..., None], *args) -> None:
-        def all_open() -> None:
-            for name in tuple(self.open):
-                self._try(name, work, *args)
+    def _each(self, work: Callable[..., Any], *args) -> None:
+        self.thread.submit(self.context.run, self._try, work, *args)  # as quiet there as here
 
-        self._later(all_open)
+    def _try(self, work: Callable[..., Any], *args) -> None:
+        for name in tuple(self.open):
+            try:
+                work(name, *args)
+            except Exception as reason:  # a library, a network or a disk is not worth the run
+                self.open.pop(name, None)
+                why = f"{type(reason).__name__}: {reason}".strip().partition("\n")[0][:300]
+                rest = "the run continues, and --resume adds what is missing"
+                terminal.warn(f"warning: --log {name} stops here ({why}); {rest}")
 
-    def _later(self, work: Callable[..., None], *args) -> None:
-        self.thread.submit(self.context.run, work, *args)  # it is as quiet there as here
-
-    def _try(self, name: str, work: Callable[..., None], *args) -> None:
-        try:
-            work(name, *args)
-        except Exception as reason:  # a library, a network or a disk is not worth the run
-            self.open.pop(name, None)
-            why = f"{type(reason).__name__}: {reason}".strip().partition("\n")[0][:300]
-            rest = "the run continues, and --resume adds what is missing"
-            terminal.warn(f"warning: --log {name} stops here ({why}); {rest}")
-
-    def _open(self, name: str, done: int) -> None:
-        state = self.state.setdefault(name, _progress({}))
-        if name in REWINDS:
-            kept = min(done, state["rows"])
-            state |= {"rows": kept, "evaluations": min(kept, state["evaluations"])}
-        self.open[name] = LOGGERS[name](
-            Place(self.run_dir, self.config, state["ids"], state["rows"])
-        )
-        files.write_json(self.path, self.state)
-        rows = (row for row, _ in files.whole_rows(self.run_dir / "metrics.jsonl"))
-        known = (row for row in rows if row["steps"] <= done)
-        for chunk in _batches(known, ITERATIONS * self.config.num_seeds):
-            self._give(name, "rows", chunk)
-        evaluations = EvaluationsFile(self.run_dir / "evaluations.jsonl").rows
-        self._give(name, "evaluations", [row for row in evaluations if row["steps"] <= done])
-
-    def _give(self, name: str, part: str, rows: list[dict[str, Any]]) -> None:
-        """Pass on those of the rows that the logger lacks."""
-        state = self.state[name]
-        if new := [row for row in rows if row["steps"] > state[part]]:
-            self.open[name].log([_entry(part, row) for row in new])
-            state[part] = new[-1]["steps"]
+    def _catch_up(self, name: str) -> None:
+        """Pass on the rows that a logger lacks, in the order of steps; open it first."""
+        loggers = self.open[name] = self.open[name] or self._opened(name)
+        new, reached = [], {}
+        for part, file in FILES.items():  # evaluations last: the disk has those of all rows before
+            rows = files.whole_rows(self.run_dir / file, self.read.get((name, part), 0))
+            for row, self.read[name, part] in rows:
+                if row["steps"] > self.known[name][part]:
+                    new.append(_entry(part, row))
+                    reached[part] = row["steps"]
+        if new:
+            new.sort(key=lambda entry: entry.steps)
+            for seed, logger in loggers.items():
+                logger.log([entry for entry in new if entry.seed == seed])
+            self.state[name] |= reached
             files.write_json(self.path, self.state)
 
+    def _opened(self, name: str) -> dict[int, MetricLogger]:
+        state = {"ids": {}, "rows": 0, "evaluations": 0} | self.state.get(name, {})
+        if name in REWINDS:
+            state |= {part: min(self.done, state[part]) for part in FILES}
+        self.state[name], self.known[name] = state, dict(state)
+        loggers, count = {}, self.config.num_seeds
+        for seed in range(self.config.seed, self.config.seed + count):
+            title = self.run_dir.resolve().name + (f"-seed-{seed}" if count > 1 else "")
+            values = flat(to_dict(dataclasses.replace(self.config, seed=seed)))
+            settings = {path: value for path, value in values.items() if value is not None}
+            known = state["ids"].get(str(seed)), state["rows"]
+            loggers[seed] = LOGGERS[name](Place(self.run_dir, title, seed, settings, *known))
+            state["ids"][str(seed)] = loggers[seed].id
+        files.write_json(self.path, self.state)
+        return loggers
+
     def _close(self, name: str, finished: bool) -> None:
-        media = [self.run_dir / each for each in MEDIA]
-        self.open.pop(name).close([path for path in media if path.exists()], finished)
+        self._catch_up(name)
+        media = [path for path in (self.run_dir / each for each in MEDIA) if path.exists()]
+        for logger in self.open.pop(name).values():
+            logger.close(media, finished)
 
 
-def _progress(found: Any) -> dict[str, Any]:
-    """Return how far a logger has come; what cannot be understood counts as nothing."""
-    found = found if isinstance(found, dict) else {}
-    ids = found.get("ids") if isinstance(found.get("ids"), dict) else {}
-
-    def steps(part: str) -> int:
-        at = found.get(part)
-        return at if type(at) is int and at >= 0 else 0
-
-    known = {seed: each for seed, each in ids.items() if isinstance(each, str)}
-    return {"ids": known, "rows": steps("rows"), "evaluations": steps("evaluations")}
+def _entry(part: str, row: dict[str, Any]) -> Entry:
+    if part == "rows":
+        values = {name: x for name, x in row.items() if name not in ("steps", "seed")}
+    else:
+        values = {f"evaluation/{name}": row[name] for name in ("return_mean", "return_std")}
+    there = {name: float(x) for name, x in values.items() if x is not None}
+    return Entry(row["seed"], row["steps"], row.get("seconds"), there)

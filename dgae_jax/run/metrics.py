@@ -35,25 +35,19 @@ class MetricsFile:
     """
 
     def __init__(self, path: Path, config: ResolvedConfig, done: int):
-        """Keep the rows of the first `done` iterations and cut off the rest.
-
-        Raises:
-            ConfigError: the file lacks any of them.
-        """
+        """Keep the rows of the first `done` iterations, which it must have; cut off the rest."""
         self.path, self.first_seed, self.seeds = path, config.seed, config.num_seeds
         self.samples = config.samples_per_iteration
         self.iteration, self.seconds, self.skipped = 0, 0.0, 0
         self.returns = array("d")
         """Episode returns of the rows so far, NaN where there was none."""
         end = 0
-        damage = FileNotFoundError, LookupError, TypeError, ValueError, OverflowError
-        with contextlib.suppress(*damage):
+        with contextlib.suppress(OSError, ArithmeticError, LookupError, TypeError, ValueError):
             for row, behind in itertools.islice(files.whole_rows(path), done * self.seeds):
                 iteration, seed = divmod(len(self.returns), self.seeds)
                 expected = iteration + 1, config.seed + seed
-                if (row["iteration"], row["seed"]) != expected:
-                    break
-                if not 0 <= row["seconds"] < math.inf:
+                whole = (row["iteration"], row["seed"]) == expected
+                if not (whole and 0 <= row["seconds"] < math.inf):
                     break
                 self._count(row)
                 end = behind
@@ -108,11 +102,8 @@ class EvaluationsFile:
     def cut(self, steps: int, seeds: int) -> None:
         """Remove what followed the first `steps` samples, and evaluations that lack a seed."""
         rows_at = Counter(row["steps"] for row in self.rows)
-
-        def whole(at: int) -> bool:
-            return at <= steps and rows_at[at] == seeds
-
-        self.rows = [row for row in self.rows if whole(row["steps"])]
+        whole = {at for at, count in rows_at.items() if at <= steps and count == seeds}
+        self.rows = [row for row in self.rows if row["steps"] in whole]
         files.replace(self.path, files.json_lines(self.rows))
 
     def has(self, steps: int) -> bool:
@@ -150,31 +141,24 @@ def _is_evaluation(row: dict[str, Any]) -> bool:
 def learning_curve(
     steps: np.ndarray, returns: np.ndarray, title: str, evaluations: np.ndarray | None = None
 ) -> "Figure":
-    """Plot undiscounted episode returns of training and evaluation over samples.
+    """Plot undiscounted episode returns [I, S] of S seeds over samples [I].
 
-    Args:
-        steps: samples [I].
-        returns: episode returns of S seeds [I, S]; a thin line each, mean ± std of several.
-        title: title of the plot.
-        evaluations: samples, mean and std of the deterministic policy's returns [E, 3].
+    `evaluations` [E, 3] are samples, mean and std of the deterministic policy's returns.
     """
     from matplotlib.figure import Figure  # takes a second, for which training does not wait
     from matplotlib.ticker import EngFormatter
 
     axes = Figure(figsize=(6.4, 4.0), layout="constrained", dpi=150).subplots()
-    seeds = returns.shape[1]
     drawn = np.linspace(0, len(steps) - 1, min(len(steps), MAX_POINTS)).astype(int)
-    steps, returns = steps[drawn], returns[drawn]
-    thin: dict[str, Any] = {"linewidth": 0.8, "alpha": 0.4}
-    style = thin if seeds > 1 else {"linewidth": 1.5, "label": "training"}
-    axes.plot(steps, returns, color="tab:blue", **style)
+    steps, returns, seeds = steps[drawn], returns[drawn], returns.shape[1]
+    mean, std, label = returns.mean(1), returns.std(1), "training"
+    blue: dict[str, Any] = {"color": "tab:blue"}
     if seeds > 1:
-        mean, std = returns.mean(1), returns.std(1)
+        axes.plot(steps, returns, linewidth=0.8, alpha=0.4, **blue)
+        shade: dict[str, Any] = {"alpha": 0.15, "linewidth": 0, "label": "± std over seeds"}
+        axes.fill_between(steps, mean - std, mean + std, **shade, **blue)
         label = f"training, mean of {seeds} seeds"
-        axes.plot(steps, mean, color="tab:blue", linewidth=2, label=label)
-        shade: dict[str, Any] = {"color": "tab:blue", "alpha": 0.15, "linewidth": 0}
-        label = "± 1 standard deviation of seeds"
-        axes.fill_between(steps, mean - std, mean + std, label=label, **shade)
+    axes.plot(steps, mean, linewidth=1.5, label=label, **blue)
     if evaluations is not None and len(evaluations):
         dots: dict[str, Any] = {"fmt": "o", "markersize": 4, "capsize": 2, "color": "tab:orange"}
         axes.errorbar(*evaluations.T, label="deterministic policy, mean ± std", **dots)

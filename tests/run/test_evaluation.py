@@ -39,14 +39,14 @@ def test_engines_of_a_run_and_their_files(tmp_path):
 
 @pytest.mark.parametrize("engine", ENGINES)
 def test_each_seed_is_reported(engine):
-    config = dataclasses.replace(SMALL, num_seeds=2, seed=3)
+    config = dataclasses.replace(SMALL, num_seeds=2, seed=3, episode_length=7)
     result = evaluate_policies(policies(config), config, engine=engine, episodes=5)
     assert result["episodes"] == len(result["returns"]) == 10
     assert [s["seed"] for s in result["seeds"]] == [3, 4]
     assert result["returns"] == result["seeds"][0]["returns"] + result["seeds"][1]["returns"]
     assert result["return_mean"] == pytest.approx(np.mean(result["returns"]), rel=1e-4)
     assert result["return_std"] == pytest.approx(np.std(result["returns"]), rel=1e-3)
-    assert 0 < result["return_mean"] < 300  # an untrained hopper falls at once
+    assert 5 < result["return_mean"] < 9  # about one per step
 
 
 def test_native_and_gymnasium_agree(state):
@@ -58,12 +58,6 @@ def test_native_and_gymnasium_agree(state):
     assert abs(ours["return_mean"] - theirs["return_mean"]) < 4 * error
 
 
-def test_no_two_seeds_share_an_initial_state():
-    numbers = np.concatenate([episodes.episode_seeds(seed, 50) for seed in range(20)])
-    assert len(set(numbers.tolist())) == 1000
-    np.testing.assert_array_equal(episodes.episode_seeds(3, 20), episodes.episode_seeds(3, 50)[:20])
-
-
 @pytest.mark.parametrize("engine", ENGINES)
 def test_seed_determines_the_episodes(engine, state):
     def returns(seed, count=6):
@@ -73,6 +67,8 @@ def test_seed_determines_the_episodes(engine, state):
     assert returns(0) == returns(0)
     assert not set(returns(0)) & set(returns(1))
     np.testing.assert_allclose(returns(0, 3), returns(0)[:3], rtol=1e-3)
+    numbers = np.concatenate([episodes.episode_seeds(seed, 50) for seed in range(20)])
+    assert len(set(numbers.tolist())) == 1000
 
 
 def test_evaluation_reports_progress_and_can_be_broken_off():
@@ -93,31 +89,18 @@ def test_evaluation_reports_progress_and_can_be_broken_off():
         assert said[-2:] == [f"{start}{n} of at most 1,000, 2 still running" for n in (0, 50)]
 
 
-@pytest.mark.parametrize("engine", ENGINES)
-def test_episode_length_limits_an_episode(engine, state):
-    config = dataclasses.replace(SMALL, episode_length=7)
-    result = evaluate_policies(policies_of(state), config, engine=engine, episodes=3)
-    assert 5 < result["return_mean"] < 9  # about one per step
-
-
 def test_gymnasium_steps_yield_what_a_video_needs():
     envs = [episodes.make_eval_env(SMALL, 5) for _ in range(2)]
 
     def qpos(env):
         return env.unwrapped.data.qpos.copy()
 
-    def act(obs):
-        return np.zeros((len(obs), 3))
-
-    steps = list(episodes.gymnasium_steps(envs, act, [1, 2], snapshot=qpos))
-    assert len(steps) == 5
-    assert [step.alive.all() for step in steps] == [True] * 4 + [False]
-    assert not steps[-1].terminated.any()  # cut off by the time limit
-    for step in steps:  # an observation begins with all positions but x
+    steps = episodes.gymnasium_steps(envs, lambda obs: np.zeros((2, 3)), [1, 2], qpos)
+    whole = list(steps)
+    assert [step.alive.all() for step in whole] == [True] * 4 + [False]
+    assert not whole[-1].terminated.any()  # cut off by the time limit
+    for step in whole:  # an observation begins with all positions but x
         np.testing.assert_allclose(step.obs[:, :5], np.stack(step.snapshots)[:, 1:])
-    assert (steps[0].reward > 0).all()
-    cut = episodes.gymnasium_steps(envs, act, [1, 2], steps=3)
-    assert len(list(cut)) == 3
 
 
 def test_several_seeds_are_described_with_their_spread():

@@ -5,6 +5,7 @@ import os
 import time
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -29,14 +30,11 @@ def test_file_and_directory_are_synced(tmp_path, monkeypatch):
     assert order == [str(tmp_path / "a.part"), "rename", str(tmp_path)]
 
 
-@pytest.mark.parametrize("step", ["fsync", "replace"])
-def test_failed_write_leaves_old_content(step, tmp_path, monkeypatch):
+@pytest.mark.parametrize(("owner", "step"), [(os, "fsync"), (Path, "replace")])
+def test_failed_write_leaves_old_content(owner, step, tmp_path, monkeypatch):
     files.replace(tmp_path / "a", b"before")
-
-    def fail(*_):
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr(os if step == "fsync" else Path, step, fail)
+    fail = Mock(side_effect=OSError(28, "No space left on device"))
+    monkeypatch.setattr(owner, step, fail)
     with pytest.raises(OSError, match="No space left") as caught:
         files.replace(tmp_path / "a", b"after")
     assert caught.value.filename == str(tmp_path / "a")

@@ -19,19 +19,17 @@ CONFIG = dataclasses.replace(SMALL, num_envs=10, num_steps=10)
 
 def test_one_row_per_iteration_and_seed(tmp_path):
     config = dataclasses.replace(CONFIG, seed=7, num_seeds=2)
-    path = tmp_path / "metrics.jsonl"
-    file = MetricsFile(path, config, 0)
-    returns = np.array([[1.5, np.nan], [2.0, 3.0], [0, 0]])
-    file.append({"episode_return": returns, "episodes": returns > 1}, 2, 1.0)
-    file.append({"episode_return": returns, "episodes": returns > 1}, 1, 2.0)
-    names = "iteration", "steps", "seed", "seconds", "episode_return", "episodes"
-    assert [tuple(row[name] for name in names) for row in metrics.read(path)] == [
-        (1, 100, 7, 1, 1.5, 1),
-        (1, 100, 8, 1, None, 0),
-        (2, 200, 7, 1, 2, 1),
-        (2, 200, 8, 1, 3, 1),
-        (3, 300, 7, 2, 1.5, 1),
-        (3, 300, 8, 2, None, 0),
+    file = MetricsFile(tmp_path / "metrics.jsonl", config, 0)
+    file.append({"episode_return": np.array([[1.5, np.nan], [2.0, 3.0], [0, 0]])}, 2, 1.0)
+    file.append({"episode_return": np.array([[4.5, 5.0]])}, 1, 2.0)
+    names = "iteration", "steps", "seed", "seconds", "episode_return"
+    assert [tuple(row[name] for name in names) for row in metrics.read(file.path)] == [
+        (1, 100, 7, 1, 1.5),
+        (1, 100, 8, 1, None),
+        (2, 200, 7, 1, 2),
+        (2, 200, 8, 1, 3),
+        (3, 300, 7, 2, 4.5),
+        (3, 300, 8, 2, 5),
     ]
 
 
@@ -50,7 +48,7 @@ def test_metrics_continue_behind_the_checkpoint(tmp_path):
         MetricsFile(path, CONFIG, 9)
 
 
-@pytest.mark.parametrize("seconds", ["NaN", "Infinity", "-1", '"inf"', "null"])
+@pytest.mark.parametrize("seconds", ["NaN", "-1", '"inf"'])
 def test_impossible_time_is_refused_and_left(seconds, tmp_path):
     path = tmp_path / "metrics.jsonl"
     MetricsFile(path, CONFIG, 0).append({"episode_return": np.zeros((2, 1))}, 2, 2.0)
@@ -81,31 +79,16 @@ def test_best_evaluation_has_highest_mean_over_seeds(tmp_path):
     np.testing.assert_array_equal(EvaluationsFile(path).points(), points)
 
 
-def test_evaluation_without_a_seed_is_cut(tmp_path):
-    path = tmp_path / "evaluations.jsonl"
-    files.append_rows(path, EVALUATIONS[:3])
-    file = EvaluationsFile(path)
-    assert file.has(200)
-    file.cut(1000, 2)
-    assert (file.has(100), file.has(200)) == (True, False)
-
-
 @pytest.mark.parametrize(
-    "row",
-    [
-        {},
-        {"steps": -1},
-        {"steps": 2.5},
-        {"steps": True},
-        {"return_mean": "9"},
-        {"return_mean": 1e400},
-        {"return_std": -1},
-    ],
+    "row", [{}, {"steps": -1}, {"steps": 2.5}, {"return_mean": "9"}, {"return_std": -1}]
 )
-def test_row_that_is_no_evaluation_is_ignored(row, tmp_path):
+def test_damaged_evaluation_does_not_count(row, tmp_path):
     path = tmp_path / "evaluations.jsonl"
     files.append_rows(path, [EVALUATIONS[0], {**EVALUATIONS[1], **row} if row else {}])
-    assert len(EvaluationsFile(path).rows) == 1
+    file = EvaluationsFile(path)
+    assert len(file.rows) == 1
+    file.cut(1000, 2)
+    assert not file.has(100)  # it lacks a seed
 
 
 def test_evaluation_with_a_diverged_seed_is_not_best(tmp_path):
@@ -138,32 +121,20 @@ def test_checkpoint_is_on_disk_before_its_evaluation(state, tmp_path, monkeypatc
     assert [row["return_mean"] for row in run.evaluations.rows] == [1.0]
 
 
-@pytest.mark.parametrize("seeds", [1, 3])
-def test_learning_curve_shows_returns_and_evaluations(seeds, tmp_path):
-    steps, returns = 10 * np.arange(1, 20), np.log(np.arange(1.0, 20)[:, None] + np.arange(seeds))
+@pytest.mark.parametrize(("seeds", "names"), [(1, 2), (3, 3)])
+def test_learning_curve_shows_returns_and_evaluations(seeds, names, tmp_path):
+    steps, returns = (
+        np.arange(1, 30_001),
+        np.sqrt(np.arange(1.0, 30_001)[:, None] + np.arange(seeds)),
+    )
     returns[:3] = np.nan
-    dots = np.array([[100, 2.0, 0.5], [150, 3.0, 0.1]])
-    plots = {"none": (steps[:3], returns[:3], None), "curve": (steps, returns, None)}
-    plots["dots"] = (steps, returns, dots)
-    images = []
-    for name, (x, y, evaluations) in plots.items():
-        figure = metrics.learning_curve(x, y, "title", evaluations)
-        metrics.save_figure(figure, tmp_path / f"{name}.png")
-        images.append(imread(tmp_path / f"{name}.png")[..., :3])
-    legend = [text.get_text() for text in figure.axes[0].get_legend().get_texts()]
-    assert len(legend) == (2 if seeds == 1 else 3)
-
-    def share(image, *color):
-        return np.mean(np.abs(image - np.array(color) / 255).max(-1) < 0.1)
-
-    blue, orange = (31, 119, 180), (255, 127, 14)
-    assert [share(image, *blue) > 0.001 for image in images[1:]] == [True, True]
-    assert [share(image, *orange) > 0.0001 for image in images] == [False, False, True]
-
-
-def test_long_run_is_drawn_in_a_thousand_points():
-    steps = np.arange(1, 30_001)
-    line = metrics.learning_curve(steps, np.sqrt(steps)[:, None], "title").axes[0].lines[0]
-    x, y = (np.asarray(each) for each in line.get_data())
-    assert (len(x), x[0], x[-1]) == (1000, 1, 30_000)
-    np.testing.assert_array_equal(y, np.sqrt(x))
+    dots = np.array([[10_000, 100.0, 5.0], [20_000, 140.0, 3.0]])
+    figure = metrics.learning_curve(steps, returns, "title", dots)
+    (axes,) = figure.axes
+    assert len(axes.get_legend().get_texts()) == names
+    (mean,) = (line for line in axes.lines if line.get_label().startswith("training"))
+    x, y = (np.asarray(each) for each in mean.get_data())
+    assert (len(x), x[0], x[-1]) == (metrics.MAX_POINTS, 1, 30_000)
+    np.testing.assert_array_equal(y, returns.mean(1)[x - 1])
+    metrics.save_figure(figure, tmp_path / "curve.png")
+    assert imread(tmp_path / "curve.png").shape == (600, 960, 4)
