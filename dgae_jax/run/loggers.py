@@ -22,9 +22,6 @@ from dgae_jax.run import files, terminal
 FILES = {"rows": "metrics.jsonl", "evaluations": "evaluations.jsonl"}
 """Files of the run directory that are logged, by their names in `sinks.json`."""
 
-MEDIA = ("curve.png", "video.mp4", "video.gif")
-"""Files of the run directory that loggers get at the end."""
-
 CONNECT_SECONDS = 3.0
 """Wait for the server of Weights & Biases before the run stays offline."""
 
@@ -64,8 +61,8 @@ class MetricLogger(Protocol):
     def log(self, entries: list[Entry]) -> None:
         """Take entries in the order of steps."""
 
-    def close(self, paths: list[Path], finished: bool) -> None:
-        """Take pictures and videos, and end; `finished` if the run reached its end."""
+    def close(self, curve: Path | None, finished: bool) -> None:
+        """Take the learning curve, if any, and end; `finished` if the run reached its end."""
 
 
 class TensorBoard:
@@ -105,13 +102,13 @@ class TensorBoard:
             self._write(step=entry.steps, summary=Summary(value=values))
         self.writer.flush()
 
-    def close(self, paths: list[Path], finished: bool) -> None:
-        """Write the PNGs."""
+    def close(self, curve: Path | None, finished: bool) -> None:
+        """Write the picture."""
         from matplotlib.image import imread
         from tensorboardX.summary import image
 
-        for path in (path for path in paths if path.suffix == ".png"):
-            self._write(summary=image(path.name, imread(path), dataformats="HWC"))
+        if curve:
+            self._write(summary=image(curve.name, imread(curve), dataformats="HWC"))
         self.writer.close()
 
 
@@ -151,13 +148,12 @@ class WeightsAndBiases:
             values = {"steps": entry.steps, **entry.values}
             self.run.log(values, step=2 * entry.steps + evaluation)
 
-    def close(self, paths: list[Path], finished: bool) -> None:
-        """Log images and videos, and finish."""
+    def close(self, curve: Path | None, finished: bool) -> None:
+        """Log the picture, and finish."""
         import wandb
 
-        kinds = {path: wandb.Image if path.suffix == ".png" else wandb.Video for path in paths}
-        if media := {path.name: kind(str(path)) for path, kind in kinds.items()}:
-            self.run.log(media, step=2 * self.last + 2)
+        if curve:
+            self.run.log({curve.name: wandb.Image(str(curve))}, step=2 * self.last + 2)
         self.run.finish(exit_code=0 if finished else 1)
 
 
@@ -183,8 +179,7 @@ class MLflow:
     """A SQLite store in RUN_DIR/mlflow, or the server that MLFLOW_TRACKING_URI names.
 
     MLflow refuses to write its older store of plain files. The times of metrics are those of the
-    run, so that a row that is given twice is one. Files are sent to a server only: the run
-    directory has them.
+    run, so that a row that is given twice is one. The picture is sent to a server only.
     """
 
     def __init__(self, place: Place):
@@ -223,10 +218,10 @@ class MLflow:
             some = metrics[i : i + MLFLOW_BATCH]
             self.client.log_batch(self.id, metrics=some, synchronous=True)
 
-    def close(self, paths: list[Path], finished: bool) -> None:
+    def close(self, curve: Path | None, finished: bool) -> None:
         """End the run."""
-        for path in paths if self.server else ():
-            self.client.log_artifact(self.id, str(path))
+        if curve and self.server:
+            self.client.log_artifact(self.id, str(curve))
         self.client.set_terminated(self.id, "FINISHED" if finished else "KILLED")
 
 
@@ -312,9 +307,9 @@ class LoggerFeed:
 
     def _close(self, name: str, finished: bool) -> None:
         self._catch_up(name)
-        media = [path for path in (self.run_dir / each for each in MEDIA) if path.exists()]
+        curve = self.run_dir / "curve.png"
         for logger in self.open.pop(name).values():
-            logger.close(media, finished)
+            logger.close(curve if curve.exists() else None, finished)
 
 
 def _entry(part: str, row: dict[str, Any]) -> Entry:

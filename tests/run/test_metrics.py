@@ -123,10 +123,8 @@ def test_checkpoint_is_on_disk_before_its_evaluation(state, tmp_path, monkeypatc
 
 @pytest.mark.parametrize(("seeds", "names"), [(1, 2), (3, 3)])
 def test_learning_curve_shows_returns_and_evaluations(seeds, names, tmp_path):
-    steps, returns = (
-        np.arange(1, 30_001),
-        np.sqrt(np.arange(1.0, 30_001)[:, None] + np.arange(seeds)),
-    )
+    steps = np.arange(1, 30_001)
+    returns = np.sqrt(steps[:, None] + np.arange(seeds))
     returns[:3] = np.nan
     dots = np.array([[10_000, 100.0, 5.0], [20_000, 140.0, 3.0]])
     figure = metrics.learning_curve(steps, returns, "title", dots)
