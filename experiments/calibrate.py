@@ -1,4 +1,4 @@
-"""Compare critics with the returns that came: python experiments/calibrate.py RUN_DIR …"""
+"""Compare critics with observed returns: python experiments/calibrate.py RUN_DIR …"""
 
 import sys
 

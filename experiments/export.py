@@ -1,4 +1,4 @@
-"""Take a trained policy out of a run: python experiments/export.py RUN_DIR --to npz"""
+"""Export a trained policy: python experiments/export.py RUN_DIR --to npz"""
 
 import sys
 

@@ -2,7 +2,7 @@
 
 import sys
 
-from dgae_jax.cli.render import figures
+from dgae_jax.cli.export import figures
 
 if __name__ == "__main__":
     sys.exit(figures())

@@ -1,4 +1,4 @@
-"""TrainableState a value distribution to a finished policy: python experiments/refit.py RUN_DIR"""
+"""Fit a value distribution to a finished policy: python experiments/refit.py RUN_DIR"""
 
 import sys
 

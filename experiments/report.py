@@ -1,4 +1,4 @@
-"""Report on studies: python experiments/report.py STUDY …"""
+"""Report on sweeps: python experiments/report.py STUDY …"""
 
 import sys
 

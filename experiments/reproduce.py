@@ -1,4 +1,4 @@
-"""Train all of a study: python experiments/reproduce.py STUDY"""
+"""Train the runs of a sweep: python experiments/reproduce.py STUDY"""
 
 import sys
 

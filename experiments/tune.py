@@ -1,4 +1,4 @@
-"""Search for settings: python experiments/tune.py --env hopper --algo dppo --trials 50"""
+"""Search for hyperparameters: python experiments/tune.py --env hopper --algo dppo"""
 
 import sys
 

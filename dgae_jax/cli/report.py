@@ -1,61 +1,45 @@
 """Report on sweeps: `dgae report STUDY …`."""
 
-import subprocess
-import sys
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import tyro
 
 from dgae_jax.cli import parse
+from dgae_jax.cli.export import RenderArguments, render
 from dgae_jax.configs.config import ConfigError, invalid
 from dgae_jax.envs.registry import spec_of
+from dgae_jax.report import results
+from dgae_jax.report.results import Row, Sweep
 from dgae_jax.run import terminal
-
-if TYPE_CHECKING:
-    from dgae_jax.report.results import Row, Sweep
 
 
 @dataclass(frozen=True)
 class Arguments:
-    """Write figures, tables and one page of HTML from the results of sweeps.
-
-    Examples:
-      dgae report studies/tuned
-      dgae report studies/tuned studies/wide --out comparison
-      dgae report studies/tuned --published --videos
-    """
+    """Write figures, tables and one page of HTML from the results of sweeps."""
 
     studies: tyro.conf.Positional[tuple[Path, ...]]
-    """Directories of sweeps, or files of their results; several are compared with the first
-    [paths]."""
+    """Directories of sweeps, or files of results; several are compared with the first [paths]."""
     out: Path | None = None
     """Directory to write to; by default report in the directory of the first sweep [path]."""
     published: bool = False
     """Mark results that others have published in the learning curves."""
     videos: bool = False
-    """Show a video of a typical run of each task, the median seed of the best algorithm; they are
-    kept in STUDY/videos."""
+    """Show a video per task, of the median seed of the best algorithm, kept in STUDY/videos."""
     markdown: Path | None = None
-    """A Markdown file in which the tables between `<!-- dgae report: NAME -->` and
-    `<!-- /dgae report -->` are replaced. NAME is returns, improvement, attribution,
-    attribution-over-tasks, risk, reach or speed; NAME of STUDY is a table that only a report on
-    that sweep replaces [path]."""
+    """A file in which tables between `<!-- dgae report: NAME -->` and `<!-- /dgae report -->` are
+    replaced; `NAME of STUDY` is a table that only a report on that sweep replaces [path]."""
 
 
 @parse.command(Arguments)
 def report(args: Arguments) -> None:
     """Write a report, after everything that can be wrong was checked."""
-    from dgae_jax.report import results
-
     if not args.studies:
         raise ConfigError("STUDIES: must be the directory of one sweep or more")
     if args.markdown and len(args.studies) > 1:
         raise invalid("markdown", args.markdown, "left out where several sweeps are compared")
     sweeps = [results.read(path) for path in args.studies]
     out = args.out or sweeps[0].directory / "report"
-    parse.check_directory(out)
     published = results.published() if args.published else []
     from dgae_jax.report import groups, markdown, page
 
@@ -71,7 +55,7 @@ def report(args: Arguments) -> None:
         terminal.say(f"written {args.markdown}: {', '.join(names)}")
 
 
-def typical(rows: list["Row"]) -> "Row":
+def typical(rows: list[Row]) -> Row:
     """Return the median seed, the better of two, of the algorithm with the highest mean return."""
     returns: dict[str, list[float]] = {}
     for row in sorted(rows, key=lambda row: row.algo):
@@ -81,7 +65,7 @@ def typical(rows: list["Row"]) -> "Row":
     return ordered[len(ordered) // 2]
 
 
-def _write_videos(sweep: "Sweep") -> None:
+def _write_videos(sweep: Sweep) -> None:
     """Render the typical run of each task that has no video yet."""
     for task in dict.fromkeys(row.task for row in sweep.rows):
         rows = [row for row in sweep.rows if row.task == task]
@@ -93,13 +77,5 @@ def _write_videos(sweep: "Sweep") -> None:
         if not run_dir.is_dir():
             raise invalid("videos", True, f"left out: the runs of {sweep.path} are not here")
         out.parent.mkdir(exist_ok=True)
-        terminal.say(f"rendering {chosen.run}")
         index = chosen.seed - int(chosen.config["seed"])
-        flags = f"--format mp4 --seconds 8 --index {index}".split()
-        # in its own process: OpenGL is chosen before MuJoCo is loaded
-        words = [sys.executable, "-m", "dgae_jax", "render", str(run_dir), "--out", str(out)]
-        done = subprocess.run([*words, *flags], capture_output=True, text=True, check=False)
-        if done.returncode:
-            reason = done.stderr.strip().removeprefix("error: ")
-            raise ConfigError(f"videos: must be left out: {reason}", "videos")
-        terminal.say(f"written {out}")
+        render.work(RenderArguments(run_dir=run_dir, index=index, format="mp4", seconds=8, out=out))

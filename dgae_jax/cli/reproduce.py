@@ -3,7 +3,7 @@
 import dataclasses
 import shlex
 import sys
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -11,16 +11,18 @@ import tyro
 
 from dgae_jax.cli import parse
 from dgae_jax.cli.train import Arguments as TrainArguments
-from dgae_jax.cli.train import configure
+from dgae_jax.cli.train import check_of_many, configure
 from dgae_jax.configs.algorithms import ALGORITHMS, AlgorithmName
-from dgae_jax.configs.config import Config, ConfigError, flag, invalid
+from dgae_jax.configs.config import Config, ConfigError, invalid
 from dgae_jax.configs.resolved import ResolvedConfig, resolve
-from dgae_jax.configs.validation import task_spec
 from dgae_jax.envs.registry import TASKS
-from dgae_jax.run.options import RunOptions, saved_options
+from dgae_jax.run.options import RunOptions
 from dgae_jax.study import sweep as sweeps
 from dgae_jax.study.launch import LaunchOptions, launcher
 from dgae_jax.study.variants import Variant, variants
+
+LAUNCH, TRAIN = LaunchOptions(), TrainArguments(settings=Config(env=""))
+"""Defaults; the tasks are those of --envs."""
 
 
 @dataclass(frozen=True)
@@ -29,11 +31,6 @@ class Arguments:
 
     Every flag of dgae train holds for all runs. The same command resumes a
     sweep that was stopped.
-
-    Examples:
-      dgae reproduce studies/tuned --envs hopper walker2d --algos ppo dppo
-      dgae reproduce studies/paper --preset paper --scale 0.1 --physics native
-      dgae reproduce studies/why --variants attribution --envs hopper --scale 0.5
     """
 
     study: tyro.conf.Positional[Path]
@@ -46,27 +43,24 @@ class Arguments:
     """All variants of one question, instead of the algorithms."""
     seeds: tuple[int, ...] = (0, 1, 2, 3, 4)
     """Seeds [1]."""
-    scale: float = 1.0
-    """Fraction of the preset's samples [1]."""
-    seeds_per_run: int = 1
+    scale: Annotated[float, parse.number(float, 1e-9, 1)] = 1.0
+    """Fraction of the samples that are trained [1]."""
+    seeds_per_run: Annotated[int, parse.number(int, 1, 4096)] = 1
     """Seeds that are trained in one program; more than 1 are meant for a GPU [runs]."""
-    launch: Annotated[LaunchOptions, tyro.conf.arg(name="")] = field(default_factory=LaunchOptions)
-    train: Annotated[TrainArguments, tyro.conf.arg(name="")] = field(default_factory=TrainArguments)
+    launch: Annotated[LaunchOptions, tyro.conf.arg(name="")] = LAUNCH
+    train: Annotated[TrainArguments, tyro.conf.arg(name="")] = TRAIN
 
 
 Sweep = tuple[Arguments, list[sweeps.RunSpec], RunOptions]
 
 
 def parsed(argv: list[str]) -> Sweep:
-    """Return the flags, the runs and their options; raise ConfigError for the first mistake."""
+    """Return the flags, the runs and their options."""
     args: Arguments = parse.arguments(Arguments, argv)
-    flags = parse.flags_in(argv)
-    _check(args, flags)
-    kinds = _kinds(args, flags)
-    options = RunOptions()
+    _check(args)
+    kinds = _kinds(args)
 
     def make(task: str, label: str) -> ResolvedConfig:
-        nonlocal options
         algo, changes = kinds[label]
         words = [*argv, "--env", task, "--algo", algo]
 
@@ -75,60 +69,41 @@ def parsed(argv: list[str]) -> Sweep:
             return dataclasses.replace(line, run=dataclasses.replace(line.run, inexact=False))
 
         settings = args.train.settings.replace(env=task, algo=algo)
-        config, options = configure(dataclasses.replace(args.train, settings=settings), parse_over)
-        return _scale(resolve(config.as_config().replace(**changes)), args.scale)
+        given = dataclasses.replace(args.train, settings=settings)
+        config, _ = configure(given, parse_over)
+        total_steps = int(args.scale * config.total_steps)
+        return resolve(config.as_config().replace(total_steps=total_steps, **changes))
 
     runs = sweeps.grid(args.envs, list(kinds), args.seeds, args.seeds_per_run, make)
-    return args, runs, dataclasses.replace(options, inexact=args.train.run.inexact)
+    return args, runs, args.train.run
 
 
-def _check(args: Arguments, flags: set[str]) -> None:
+def _check(args: Arguments) -> None:
     """Raise ConfigError for the first flag that is invalid for the sweep as a whole."""
     for name in ("envs", "algos", "seeds"):
         if not (given := getattr(args, name)) or len(set(given)) < len(given):
             raise invalid(name, given, "at least one, each once")
-    for env in args.envs:
-        task_spec(Config(env=env), "envs")
-        if Config(env=env).env != env:
-            raise invalid("envs", env, "in lower case; --env-version says which version")
     if not all(0 <= seed < 2**32 for seed in args.seeds):
         raise invalid("seeds", args.seeds, f"whole numbers from 0 to {2**32 - 1:,}")
-    if not 0 < args.scale <= 1:
-        raise invalid("scale", args.scale, "above 0 and at most 1")
-    parse.check(args, seeds_per_run=(1, len(args.seeds), "the number of seeds"))
-    if args.scale != 1 and "--total-steps" in flags:
-        raise invalid("scale", args.scale, "left out with --total-steps")
-    of_all = {*saved_options(RunOptions()), "cache_dir", "inexact"}
-    of_one = [f.name for f in dataclasses.fields(RunOptions) if f.name not in of_all]
-    for name in ("env", "algo", "seed", "num_seeds", *of_one):
-        if flag(name) in flags:
-            raise ConfigError(f"{flag(name)}: must be left out: the sweep has many runs")
+    for env in args.envs:
+        if Config(env=env).env != env:
+            raise invalid("envs", env, "in lower case; --env-version says which version")
+    if args.train.settings.env or args.train.settings.algo:
+        raise ConfigError("--env, --algo: must be left out; a sweep has --envs and --algos")
+    check_of_many(args.train)
 
 
-def _kinds(args: Arguments, flags: set[str]) -> dict[str, Variant]:
+def _kinds(args: Arguments) -> dict[str, Variant]:
     """Return what is trained on each task by its label: an algorithm, and settings."""
-    file = args.train.config
+    given = args.train.settings
     if args.variants is None:
-        if file and len(args.algos) > 1:
-            raise invalid("config", file, "used with one of --algos")
         return {algo: (algo, {}) for algo in args.algos}
-    if file:
-        raise invalid("config", file, "left out with --variants: each has its algorithm")
-    if args.algos != Arguments.algos:
-        raise invalid("algos", args.algos, "left out with --variants")
     kinds = variants(args.variants)
-    for name in sorted({flag(path) for _, changes in kinds.values() for path in changes} & flags):
-        raise ConfigError(f"{name}: must be left out with --variants {args.variants}, which set it")
+    for path in {path for _, changes in kinds.values() for path in changes}:
+        if given.get(path) != TRAIN.settings.get(path):
+            allowed = f"left out with --variants {args.variants}, which set it"
+            raise invalid(path, given.get(path), allowed)
     return kinds
-
-
-def _scale(config: ResolvedConfig, scale: float) -> ResolvedConfig:
-    steps = int(scale * config.total_steps)
-    if steps < config.samples_per_iteration:
-        share = f"{config.samples_per_iteration:,} of {config.total_steps:,} samples"
-        allowed = f"enough for one iteration of {config.algo} on {config.env}, {share}"
-        raise invalid("scale", scale, allowed)
-    return dataclasses.replace(config, total_steps=steps)
 
 
 @parse.command(Arguments, parsed)

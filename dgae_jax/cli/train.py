@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 import tyro
 
 from dgae_jax.cli import parse
-from dgae_jax.configs.config import Config, invalid
+from dgae_jax.configs.config import Config, ConfigError, flag, invalid
 from dgae_jax.configs.presets import preset
 from dgae_jax.configs.resolved import ResolvedConfig, resolve
 from dgae_jax.run import directory
@@ -24,9 +24,8 @@ class Arguments:
     1_000_000, and tasks Hopper-v4.
 
     Examples:
-      dgae train --env hopper --algo dppo --physics native --total-steps 2e5
-      dgae train --env Walker2d-v5 --algo ppo --run-dir runs/walker
-      dgae train --resume runs/walker
+      dgae train --env hopper --algo dppo --physics native --run-dir runs/first
+      dgae train --resume runs/first --total-steps 2e6
     """
 
     preset: Literal["tuned", "paper"] | None = None
@@ -34,31 +33,36 @@ class Arguments:
     config: Path | None = None
     """A config.json, of a run for example, where all other settings start instead [path]."""
     settings: Annotated[Config, tyro.conf.arg(name="")] = field(default_factory=Config)
-    shared: Annotated[parse.SharedSettings, tyro.conf.arg(name="")] = field(
-        default_factory=parse.SharedSettings
-    )
+    shared: Annotated[parse.Shared, tyro.conf.arg(name="")] = field(default_factory=parse.Shared)
     run: Annotated[RunOptions, tyro.conf.arg(name="")] = field(default_factory=RunOptions)
 
 
-def parsed(argv: list[str]) -> tuple[ResolvedConfig, RunOptions]:
-    """Return the configuration and the options of a command line.
+DEFAULTS = Arguments()
 
-    Raises:
-        ConfigError: the first setting that is invalid.
-    """
-    given = parse.peek(Arguments, argv) or Arguments()
+OF_ONE_RUN = (
+    *("seed", "num_seeds", "run_dir", "resume", "resume_or_start"),
+    *("coordinator", "num_processes", "process_id"),
+)
+
+
+def check_of_many(given: Arguments) -> None:
+    """Raise ConfigError for a flag that has no meaning for many runs."""
+    for name in OF_ONE_RUN:
+        part = "run" if hasattr(given.run, name) else "settings"
+        if getattr(getattr(given, part), name) != getattr(getattr(DEFAULTS, part), name):
+            raise ConfigError(f"{flag(name)}: must be left out: there are many runs")
+
+
+def parsed(argv: list[str]) -> tuple[ResolvedConfig, RunOptions]:
+    """Return the configuration and the options of a command line."""
+    given = parse.peek(Arguments, argv) or DEFAULTS
     return configure(given, lambda start: parse.arguments(Arguments, argv, start))
 
 
 def configure(
     given: Arguments, parse_over: Callable[[Arguments], Arguments]
 ) -> tuple[ResolvedConfig, RunOptions]:
-    """Parse a command line over the settings where it starts, and check what it says.
-
-    Args:
-        given: the command line parsed over unset settings, which names preset, task and parts.
-        parse_over: parses it again, over the defaults that it is given.
-    """
+    """Parse a command line over the settings where it starts, which `given` names, and check it."""
     resume, file = given.run.resume, given.run.resume or given.config
     options = directory.saved_options(resume) if resume else RunOptions()
     start = _start(given)

@@ -22,10 +22,7 @@ def test_training_writes_a_run_directory(trained):
     run_dir, lines, errors = trained
     names = "config.json manifest.json metrics.jsonl evaluations.jsonl evaluation.json"
     assert {p.name for p in run_dir.iterdir()} == {*names.split(), "checkpoints", "curve.png"}
-    assert (run_dir / "curve.png").read_bytes().startswith(b"\x89PNG")
-    assert json.loads((run_dir / "config.json").read_text())["critic"]["target"] == "sr-lambda"
-    assert "\x1b" not in "".join(lines)
-    assert errors == ""
+    assert (errors, "\x1b" in "".join(lines)) == ("", False)
 
 
 def test_the_budget_is_never_exceeded_and_the_last_line_is_the_return(trained):
@@ -34,18 +31,20 @@ def test_the_budget_is_never_exceeded_and_the_last_line_is_the_return(trained):
     rows = metrics.read(run_dir / "metrics.jsonl")
     assert [row["steps"] for row in rows] == list(range(64, 961, 64))
     result = json.loads((run_dir / "evaluation.json").read_text())
-    assert (result["engine"], len(result["returns"])) == ("gymnasium", 3)
     assert f"return {result['return_mean']:,.1f} ± {result['return_std']:,.1f}" in lines[-1]
-    assert lines[-1].endswith(str(run_dir))
 
 
-def test_checkpoints_are_evaluated_during_training_and_the_best_is_kept(trained):
+def test_checkpoints_are_evaluated_and_the_best_is_kept(trained, dgae, tmp_path):
     run_dir, _, _ = trained
     evaluations = metrics.read(run_dir / "evaluations.jsonl")
     assert [row["steps"] for row in evaluations] == [256, 512, 768, 960]
     best = max(evaluations[:-1], key=lambda row: (row["return_mean"], row["steps"]))["steps"]
     names = [p.name for p in sorted((run_dir / "checkpoints").iterdir())]
     assert names == [f"steps_{steps:012d}.msgpack" for steps in sorted({best, 512, 768, 960})]
+    out = tmp_path / "best.json"
+    dgae("evaluate", run_dir, "--checkpoint", "best", "--episodes", 3, "--out", out)
+    expected = max(row["return_mean"] for row in evaluations)
+    assert json.loads(out.read_text())["return_mean"] == pytest.approx(expected)
 
 
 @pytest.mark.parametrize("engine", ["gymnasium", "native"])
@@ -59,24 +58,13 @@ def test_evaluate_writes_json(engine, trained, dgae):
         assert result["returns"] == final["returns"]
 
 
-def test_evaluate_takes_the_best_checkpoint(trained, dgae, tmp_path):
-    rows = metrics.read(trained[0] / "evaluations.jsonl")
-    out = tmp_path / "best.json"
-    assert (
-        dgae("evaluate", trained[0], "--checkpoint", "best", "--episodes", 3, "--out", out)[0] == 0
-    )
-    best = max(row["return_mean"] for row in rows)
-    assert json.loads(out.read_text())["return_mean"] == pytest.approx(best)
-
-
 def test_an_output_that_is_no_file_is_left_alone(trained, dgae, tmp_path):
     os.mkfifo(tmp_path / "pipe")
     (tmp_path / "link").symlink_to(tmp_path / "pipe")
-    for name in ("pipe", "link", "."):
+    for name in ("pipe", "link", ".", "no/file"):
         code, _, err = dgae("evaluate", trained[0], "--out", tmp_path / name)
         assert code == 2
-        assert "must be a file, not a directory, a link or a device" in err
-    assert "in a directory that exists" in dgae("evaluate", trained[0], "--out", "no/file")[2]
+        assert "must be a file, new or not, in a directory that exists" in err
     assert (tmp_path / "pipe").is_fifo()
 
 
@@ -148,10 +136,3 @@ def test_a_signal_saves_a_checkpoint_and_ends_with_its_code(kind, code, tmp_path
     assert f"stopped by {kind.name}; continue with --resume" in out
     steps = metrics.read(lines)[-1]["steps"]
     assert (tmp_path / "run" / "checkpoints" / f"steps_{steps:012d}.msgpack").exists()
-
-
-def test_importing_the_package_prints_nothing_and_is_light():
-    heavy = "('matplotlib', 'gymnasium', 'flask', 'tyro', 'IPython')"
-    code = f"import dgae_jax, sys; print([m for m in {heavy} if m in sys.modules])"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stdout == "[]\n"
