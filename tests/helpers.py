@@ -1,4 +1,4 @@
-"""Helpers of several test files: a small configuration, the commands, checkpoints made by hand."""
+"""Helpers of several test files: a small configuration, checkpoints made by hand."""
 
 import dataclasses
 import hashlib
@@ -10,7 +10,6 @@ import jax
 import jax.numpy as jnp
 
 import dgae_jax as dg
-from dgae_jax.cli import main
 from dgae_jax.run import checkpoint
 
 ROOT = Path(__file__).parent.parent
@@ -37,11 +36,6 @@ CACHE = f"{tempfile.gettempdir()}/dgae_jax_tests"
 TINY = f"""--physics native --num-envs 4 --num-steps 16 --policy.hidden 8 --critic.hidden 8
 --policy.minibatches 4 --critic.minibatches 4 --cache-dir {CACHE}""".split()
 """Flags of a small run; processes share its compiled programs."""
-
-
-def command(name):
-    """Return the function of a command."""
-    return main.command(name)
 
 
 def signed(arrays):

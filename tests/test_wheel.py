@@ -3,6 +3,7 @@
 import os
 import subprocess
 import sys
+from importlib.util import find_spec
 
 import pytest
 
@@ -28,14 +29,12 @@ def test_an_installed_wheel_trains_exports_and_reports(tmp_path):
     site, place = tmp_path / "site", tmp_path / "place"
     place.mkdir()
     pip = [sys.executable, "-m", "pip"]
-    hatchling = subprocess.run([sys.executable, "-c", "import hatchling"], capture_output=True)
-    build = ["--no-build-isolation"] * (hatchling.returncode == 0)
+    build = ["--no-build-isolation"] * (find_spec("hatchling") is not None)
     wheel = [*pip, "wheel", ".", "--no-deps", "--quiet", "--wheel-dir", str(tmp_path), *build]
     subprocess.run(wheel, cwd=ROOT, check=True)
     name = str(next(tmp_path.glob("dgae_jax-*.whl")))
-    subprocess.run(
-        [*pip, "install", "--no-deps", "--quiet", "--target", str(site), name], check=True
-    )
+    install = [*pip, "install", "--no-deps", "--quiet", "--target", str(site), name]
+    subprocess.run(install, check=True)
     environment = {**os.environ, "PYTHONPATH": str(site)}
     for words, made in MADE.items():
         program = [sys.executable, str(site / "bin" / "dgae"), *words.split()]

@@ -19,9 +19,8 @@ from dgae_jax.run.options import RunOptions, validate_options
 class Arguments:
     """Train a policy with PPO, TRPO, A2C or a distributional variant of them.
 
-    The defaults are those of the preset for the task and the algorithm:
-    dgae train --algo trpo --help shows TRPO's. Numbers may be written 1e6 or
-    1_000_000, and tasks Hopper-v4.
+    The defaults are those of the preset for the task and the algorithm: with
+    --algo trpo, --help shows those of TRPO. Numbers may be 1e6, tasks Hopper-v4.
 
     Examples:
       dgae train --env hopper --algo dppo --physics native --run-dir runs/first

@@ -2,7 +2,6 @@
 
 import json
 import os
-import re
 import signal
 import subprocess
 import sys
@@ -11,10 +10,9 @@ import time
 
 import pytest
 
-from dgae_jax.cli import parse, train
+from dgae_jax.cli import parse
 from dgae_jax.cli.train import parsed
 from dgae_jax.run import directory, metrics, runtime
-from dgae_jax.run.options import METRIC_LOGGERS
 from tests.helpers import ROOT, TINY
 
 
@@ -74,44 +72,16 @@ def test_a_resumed_run_starts_from_its_own_flags(trained):
     assert (options.checkpoint_every, options.episodes, options.keep_checkpoints) == (300, 5, 3)
 
 
-def test_a_missing_metric_logger_is_named_with_its_extra(dgae, monkeypatch, tmp_path):
-    assert parsed(["--log", "tensorboard"])[1].log == ("tensorboard",)
-    assert parsed(["--log", "--env", "hopper"])[1].log == ()
-    monkeypatch.setitem(METRIC_LOGGERS, "wandb", "a_library_that_nobody_has")
-    code, _, err = dgae("train", "--log", "wandb", "--run-dir", tmp_path / "run")
-    assert code == 2
-    assert err.endswith('is missing; pip install "dgae_jax[wandb]"\n')
-    assert not (tmp_path / "run").exists()
-
-
-def test_a_device_that_is_not_there_is_refused(tmp_path):
-    done = subprocess.run(
-        [sys.executable, "-m", "dgae_jax", "train", "--run-dir", str(tmp_path / "run")],
-        cwd=ROOT,
-        capture_output=True,
-        text=True,
-        env={**os.environ, "JAX_PLATFORMS": "abacus"},
-    )
-    assert (done.returncode, done.stdout) == (2, "")
-    assert re.fullmatch(r"error: JAX_PLATFORMS=abacus: must name a device .*\n", done.stderr)
-    assert not (tmp_path / "run").exists()
-
-
-def test_an_interrupt_ends_with_130_and_one_line(dgae, monkeypatch):
-    def interrupt(*_):
+def test_an_interrupt_ends_the_process_under_a_running_compiler(monkeypatch, capsys):
+    def interrupt(argv):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(train, "configure", interrupt)
-    assert dgae("train") == (130, "", "stopped by SIGINT\n")
-
-
-def test_an_interrupt_ends_the_process_under_a_running_compiler(monkeypatch, capsys):
-    codes, idle = [], threading.Event()
+    codes, idle, command = [], threading.Event(), parse.Command(None, interrupt, None)
     monkeypatch.setattr(os, "_exit", codes.append)
-    assert (parse.interrupted(), codes) == (130, [])
+    assert (command(), codes, capsys.readouterr().err) == (130, [], "stopped by SIGINT\n")
     left = threading.Thread(target=idle.wait, name=runtime.COMPILER_THREAD, daemon=True)
     left.start()
-    parse.interrupted()
+    command()
     idle.set()
     left.join()
     assert codes == [130]

@@ -15,9 +15,8 @@ from dgae_jax.cli.train import parsed
 from dgae_jax.configs.config import ConfigError
 from dgae_jax.configs.resolved import resolve
 from dgae_jax.configs.serial import from_dict, to_dict
-from dgae_jax.run import checkpoint, directory, files, metrics
+from dgae_jax.run import checkpoint, files, metrics
 from dgae_jax.run.checkpoint import CheckpointError
-from dgae_jax.run.options import RunOptions
 from tests.helpers import signed
 
 SETTINGS = settings(
@@ -76,19 +75,6 @@ def test_any_tail_of_metrics_and_evaluations_is_cut_or_refused(tmp_path_factory,
     with contextlib.suppress(ConfigError):
         assert metrics.MetricsFile(path, dg.Config(), 3).seconds == 1.0
         assert [row["iteration"] for row in metrics.read(path)] == [1, 2, 3]
-
-
-MANIFEST = st.fixed_dictionaries({}, optional={"resumed": PLAIN, "versions": PLAIN})
-
-
-@SETTINGS
-@given(PLAIN | MANIFEST, st.binary(max_size=20))
-def test_any_manifest_is_of_another_machine_and_can_be_extended(tmp_path_factory, data, noise):
-    run_dir = tmp_path_factory.mktemp("manifest")
-    (run_dir / "manifest.json").write_bytes(json.dumps(data).encode() + noise)
-    assert directory.environment_changes(run_dir, RunOptions())
-    directory.extend_manifest(run_dir, directory.saved_options(run_dir))
-    assert directory.environment_changes(run_dir, directory.saved_options(run_dir)) == []
 
 
 ARRAY = msgpack.ExtType(checkpoint.ARRAY, msgpack.packb(((2,), "float32", bytes(8))))

@@ -21,10 +21,8 @@ def test_a_report_is_written_beside_the_results(dgae, tmp_path):
 
 def test_two_sweeps_are_compared(dgae, tmp_path):
     one, two = study(tmp_path / "one", plain([1, 3])), study(tmp_path / "two", plain([5, 5]))
-    out = tmp_path / "a" / "b"
-    assert dgae("report", one, two / "results.jsonl", "--out", out)[0] == 0
-    assert "+3 [+2, +4]" in (out / "report.html").read_text()
-    assert len(list(out.glob("*-learning.png"))) == 2
+    assert dgae("report", one, two / "results.jsonl", "--out", tmp_path / "a" / "b")[0] == 0
+    assert "+3 [+2, +4]" in (tmp_path / "a" / "b" / "report.html").read_text()
 
 
 def test_tables_in_a_document_are_replaced(dgae, tmp_path):
@@ -46,10 +44,8 @@ def test_the_typical_run_is_the_median_seed_of_the_best_algorithm(tmp_path):
     [
         ("", "STUDIES: must be the directory of one sweep or more"),
         ("TMP/none", "TMP/none: must be the directory of a sweep"),
-        ("TMP", "TMP: must be the directory of a sweep"),
         ("GOOD --videos", "--videos True: must be left out: the runs of GOOD are not here"),
         ("GOOD --out GOOD/study.json", "--out GOOD/study.json: must be a directory that can be"),
-        ("GOOD --out /proc/x", "--out /proc/x: must be a directory that can be written"),
         ("GOOD --markdown TMP/no.md", "--markdown TMP/no.md: must be a file that can be read"),
         ("GOOD GOOD --markdown x", "--markdown x: must be left out where several sweeps"),
     ],

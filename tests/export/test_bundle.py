@@ -16,6 +16,7 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 import dgae_jax as dg
+from dgae_jax.cli.main import command
 from dgae_jax.configs.config import ConfigError
 from dgae_jax.configs.resolved import resolve
 from dgae_jax.export import arrays, bundle
@@ -24,7 +25,7 @@ from dgae_jax.run import checkpoint
 from dgae_jax.run.directory import read_config
 from dgae_jax.run.evaluation import evaluate_policies
 from tests.export.conftest import make_untrained
-from tests.helpers import ROOT, command
+from tests.helpers import ROOT
 from tests.runs import last, small
 
 FORMATS = ("npz", "onnx", "gymnasium")
