@@ -72,29 +72,6 @@ class Target(Probe):
         return state.replace(reward=-((action[0] - 0.5 * state.obs[0]) ** 2), done=jnp.ones(()))
 
 
-class Delayed(Probe):
-    """Three steps, observed, of which the last pays 8: with γ = ½ the values are 2, 4, 8."""
-
-    observation_size = 3
-
-    def reset(self, rng):
-        return first(jnp.array([1.0, 0, 0]))
-
-    def step(self, state, action):
-        last = state.obs[2]
-        return state.replace(obs=jnp.roll(state.obs, 1) * (1 - last), reward=8 * last, done=last)
-
-
-class Coin(Probe):
-    """One-step episodes that pay 1 or −1 by a hidden coin."""
-
-    def reset(self, rng):
-        return first(jnp.ones(1), jax.random.rademacher(rng, (), jnp.float32))
-
-    def step(self, state, action):
-        return state.replace(reward=state.pipeline_state, done=jnp.ones(()))
-
-
 class Constant(Probe):
     """Reward 1 at every step, forever: the value is 1 / (1 − γ)."""
 

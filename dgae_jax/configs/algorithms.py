@@ -9,13 +9,10 @@ class Row(NamedTuple):
     """Parts of an algorithm; each is a key of a table in `configs.parts`."""
 
     critic: str
-    """Key of `CRITICS`: one value, or quantiles."""
     residual: str
-    """Key of `RESIDUALS`: the TD error, the one thing that DGAE changes."""
+    """TD error: the one thing that DGAE changes."""
     target: str
-    """Key of `TARGETS`: what the critic is fitted to."""
     policy_update: str
-    """Key of `UPDATES`: how the policy improves."""
 
 
 ALGORITHMS: dict[str, Row] = {

@@ -1,23 +1,23 @@
 """The configuration of a run as a user writes it: every number that decides the result.
 
-A setting that is None is unset; `configs.resolved.resolve` fills in what the algorithm and the
-task take.
+A setting that is None is unset; `configs.resolved.resolve` fills it in.
 """
 
 import dataclasses
 from dataclasses import dataclass, field, fields
+from operator import attrgetter
 from typing import Any, Literal, Self
 
 from dgae_jax.configs.algorithms import ALGORITHMS, AlgorithmName
 from dgae_jax.envs.registry import canonical_name
 
+TargetName = Literal[
+    "bellman", "bellman-frozen", "lambda-shift", "sr-lambda", "lambda-return", "monte-carlo"
+]
+
 
 class ConfigError(ValueError):
-    """An invalid setting; the message names the setting, the value and what is allowed.
-
-    `setting` is the dotted path of the setting that the message begins with, if any; a command
-    line shows it as its flag.
-    """
+    """An invalid setting: its path (a command line shows its flag), value, and what is allowed."""
 
     def __init__(self, message: str, setting: str | None = None):
         super().__init__(message)
@@ -35,19 +35,15 @@ class Settings:
 
     def __post_init__(self):
         floats = floats_of(type(self))
-        for f in fields(self):  # pyright: ignore[reportArgumentType]
-            value = getattr(self, f.name)
-            if f.name in floats and type(value) is int:
-                object.__setattr__(self, f.name, float(value))
+        for name, value in vars(self).items():
+            if name in floats and type(value) is int:
+                object.__setattr__(self, name, float(value))
             if isinstance(value, list):
-                object.__setattr__(self, f.name, tuple(value))
+                object.__setattr__(self, name, tuple(value))
 
     def get(self, path: str) -> Any:
         """Return the setting at a dotted path, `policy.clip_eps` for one."""
-        value: Any = self
-        for name in path.split("."):
-            value = getattr(value, name)
-        return value
+        return attrgetter(path)(self)
 
     def replace(self, **settings: Any) -> Self:
         """Return a copy with some settings changed: `config.replace(**{"policy.clip_eps": 0.3})`.
@@ -67,10 +63,8 @@ class Settings:
     def has(self, path: str) -> bool:
         """Return whether there is a setting at a dotted path."""
         name, _, rest = path.partition(".")
-        if not rest:
-            return name in vars(self)
         group = vars(self).get(name)
-        return isinstance(group, Settings) and group.has(rest)
+        return isinstance(group, Settings) and group.has(rest) if rest else name in vars(self)
 
 
 def floats_of(cls: type) -> list[str]:
@@ -130,12 +124,7 @@ class CriticConfig(FitConfig):
     kind: Literal["scalar", "quantile", "sorted", "ordered"] | None = None
     """scalar (one value), quantile (a distribution), sorted (quantiles sorted after the network)
     or ordered (quantiles that cannot cross); unset: the algorithm's own."""
-    target: (
-        Literal[
-            "bellman", "bellman-frozen", "lambda-shift", "sr-lambda", "lambda-return", "monte-carlo"
-        ]
-        | None
-    ) = None
+    target: TargetName | None = None
     """Target of the fit; unset: the algorithm's own."""
     quantiles: int | None = None
     """Quantiles K of a distributional critic [1]."""
@@ -204,10 +193,7 @@ class CommonConfig(Settings):
 
 @dataclass(frozen=True)
 class Config(CommonConfig):
-    """One training run, as a user writes it.
-
-    Names are understood as other trainers write them: `env="Hopper-v4"`, `algo="PPO"`.
-    """
+    """One training run, as a user writes it; `Hopper-v4` and `PPO` are understood too."""
 
     env_version: str | None = None
     """Gymnasium version of the task, v4 or v5; unset: v4, or none for a third-party env."""

@@ -1,7 +1,6 @@
 """Settings that belong together: `tuned` (ours) and `paper` (its set-up).
 
-Each preset is a list of conditions and the settings that hold where they do; later rows override
-earlier ones. Settings are named by their dotted paths.
+Settings are named by their dotted paths; later ones override earlier ones.
 """
 
 from typing import Any
@@ -14,11 +13,13 @@ from dgae_jax.configs.validation import lookup
 Overrides = dict[str, Any]
 
 
-def _tuned(update: str, critic: str, env: str) -> list[Overrides]:
+def _tuned(update: str, critic: str, env: str) -> Overrides:
     """Return one group of settings per update; a task departs from it only where it must."""
-    by_update: dict[str, Overrides] = {
-        "clip": {"num_envs": 64, "num_steps": 32},
-        "gradient": {
+    settings: Overrides = {}
+    if update == "clip":
+        settings |= {"num_envs": 64, "num_steps": 32}
+    if update == "gradient":
+        settings |= {
             "num_steps": 32,
             "policy.optimizer": "rmsprop",
             "policy.learning_rate": 7e-4,
@@ -27,8 +28,9 @@ def _tuned(update: str, critic: str, env: str) -> list[Overrides]:
             "critic.learning_rate": 1e-3,
             "critic.epochs": 5,
             "critic.minibatches": 16,
-        },
-        "trust-region": {
+        }
+    if update == "trust-region":
+        settings |= {
             "gamma": 0.995,  # at 0.99 some seeds of Hopper hop faster and faster, and fall
             "policy.initial_std": 1.0,
             "policy.max_kl": 0.03,
@@ -39,76 +41,67 @@ def _tuned(update: str, critic: str, env: str) -> list[Overrides]:
             "critic.learning_rate_end": 1.0,
             "critic.epochs": 20,
             "critic.minibatches": 16,
-        },
-    }
-    # Hopper: with γ = 0.99 a faster hop is worth a later fall; with σ = 0.5 some seeds stand still.
-    # Ant: with a longer λ it learns later; with σ = 1 it falls before it has walked; max_kl is for
-    # 8 action dimensions instead of 3.
-    # Swimmer: a stroke pays late, so short rollouts do not see it.
-    by_env: dict[str, list[Overrides]] = {
-        "hopper": [
-            {"gamma": 0.995, "policy.initial_std": 1.0},
-            {"num_envs": 16, "num_steps": 128} if update == "clip" else {},
-        ],
-        "ant": [
-            {"gae_lambda": 0.8},
-            {"gamma": 0.99, "policy.initial_std": 0.5, "policy.max_kl": 0.08}
-            if update == "trust-region"
-            else {},
-        ],
-        "swimmer": [
-            {"gamma": 0.9999},
-            {"num_envs": 2, "num_steps": 1024, "gae_lambda": 0.99, "policy.initial_std": 1.0}
-            if update != "gradient"
-            else {},
-            {"policy.max_kl": 0.01} if update == "trust-region" else {},
-        ],
-    }
-    return [by_update.get(update, {}), *by_env.get(env, [])]
+        }
+    if env == "hopper":
+        # with γ = 0.99 a faster hop is worth a later fall; with σ = 0.5 some seeds stand still
+        settings |= {"gamma": 0.995, "policy.initial_std": 1.0}
+        if update == "clip":
+            settings |= {"num_envs": 16, "num_steps": 128}
+    if env == "ant":
+        settings |= {"gae_lambda": 0.8}  # with a longer λ it learns later
+        if update == "trust-region":
+            # with σ = 1 it falls before it has walked; max_kl for 8 action dimensions, not 3
+            settings |= {"gamma": 0.99, "policy.initial_std": 0.5, "policy.max_kl": 0.08}
+    if env == "swimmer":
+        settings |= {"gamma": 0.9999}
+        if update != "gradient":  # a stroke pays late, so short rollouts do not see it
+            settings |= {"num_envs": 2, "num_steps": 1024, "gae_lambda": 0.99}
+            settings |= {"policy.initial_std": 1.0}
+        if update == "trust-region":
+            settings |= {"policy.max_kl": 0.01}
+    return settings
 
 
-def _paper(update: str, critic: str, env: str) -> list[Overrides]:
+def _paper(update: str, critic: str, env: str) -> Overrides:
     """Return the paper's set-up (Sec. results); docs/reproducing.md lists what it leaves open."""
     ant = env == "ant"
     hidden = (512, 512) if ant else (256, 256)
-    distribution = "quantiles" in CRITICS[critic]
-    for_all: Overrides = {
+    settings: Overrides = {
         "total_steps": 10_000_000 if env in ("ant", "hopper") else 5_000_000,
         "policy.hidden": hidden,
         "policy.covariance": "state",
         "policy.initial_std": 1.0,
         "critic.hidden": hidden,
         "critic.learning_rate_end": 1.0,
-        "critic.target": "bellman" if distribution else "lambda-return",
-        **({"critic.quantiles": 64} if distribution else {}),
+        "critic.target": "lambda-return",
     }
-    once = {
-        "optimizer": "rmsprop",
-        "learning_rate": 7e-4,
-        "learning_rate_end": 1.0,
-        "epochs": 1,
-        "minibatches": 1,
-    }
-    by_update: dict[str, Overrides] = {
-        "clip": {
+    if "quantiles" in CRITICS[critic]:
+        settings |= {"critic.target": "bellman", "critic.quantiles": 64}
+    if update == "clip":
+        settings |= {
             "num_steps": 256 if ant else 128,
             "policy.minibatches": 64 if ant else 32,
             "policy.learning_rate_end": 1.0,
             "critic.minibatches": 64 if ant else 32,
-        },
-        "trust-region": {
+        }
+    if update == "trust-region":
+        settings |= {
             "num_envs": 50 if ant else 25,
             "num_steps": 1000,
             "critic.learning_rate": 1e-3,
             "critic.minibatches": 500 if ant else 250,
-        },
-        "gradient": {
-            "num_steps": 5,
-            **{f"policy.{name}": value for name, value in once.items()},
-            **{f"critic.{name}": value for name, value in once.items()},
-        },
-    }
-    return [for_all, by_update.get(update, {})]
+        }
+    if update == "gradient":
+        settings |= {"num_steps": 5}
+        for network in ("policy", "critic"):
+            settings |= {
+                f"{network}.optimizer": "rmsprop",
+                f"{network}.learning_rate": 7e-4,
+                f"{network}.learning_rate_end": 1.0,
+                f"{network}.epochs": 1,
+                f"{network}.minibatches": 1,
+            }
+    return settings
 
 
 PRESETS = {"tuned": _tuned, "paper": _paper}
@@ -130,11 +123,9 @@ def preset(
         ConfigError: a name does not exist.
     """
     config = Config(env=env, algo=algo)  # pyright: ignore[reportArgumentType]
-    groups, row = lookup("preset", name, PRESETS), lookup("algo", config.algo, ALGORITHMS)
+    overrides, row = lookup("preset", name, PRESETS), lookup("algo", config.algo, ALGORITHMS)
     config = config.replace(**{"policy.update": update, "critic.kind": critic})
     update, critic = update or row.policy_update, critic or row.critic
     lookup("policy.update", update, UPDATES)
     lookup("critic.kind", critic, CRITICS)
-    for overrides in groups(update, critic, config.env):
-        config = config.replace(**overrides)
-    return config
+    return config.replace(**overrides(update, critic, config.env))

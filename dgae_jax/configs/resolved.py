@@ -3,7 +3,7 @@
 `resolve` is the border: what lies below it takes a `ResolvedConfig` and checks nothing again.
 """
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -12,29 +12,20 @@ from dgae_jax.configs.algorithms import ALGORITHMS
 from dgae_jax.configs.config import (
     CommonConfig,
     Config,
-    ConfigError,
     CriticConfig,
     PolicyConfig,
     Settings,
+    invalid,
 )
 from dgae_jax.configs.parts import CRITICS, SGD, UPDATES
 from dgae_jax.configs.validation import lookup
 
 
-@dataclass(frozen=True)
-class Options(Mapping[str, Any]):
-    """The settings of one part, to be passed to its function: `**options`; hashable."""
+class Options(dict[str, Any]):
+    """The settings of one part, to be passed to its function: `**options`; never changed."""
 
-    pairs: tuple[tuple[str, Any], ...] = ()
-
-    def __getitem__(self, name: str) -> Any:
-        return dict(self.pairs)[name]
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(dict(self.pairs))
-
-    def __len__(self) -> int:
-        return len(self.pairs)
+    def __hash__(self) -> int:  # pyright: ignore[reportIncompatibleVariableOverride]
+        return hash(frozenset(self.items()))
 
 
 @dataclass(frozen=True)
@@ -91,28 +82,9 @@ class ResolvedConfig(CommonConfig):
 
     def as_config(self) -> Config:
         """Return the same run as a user would write it out, to be changed and resolved again."""
-        policy, critic = self.policy, self.critic
-        return Config(
-            **{
-                name: value
-                for name, value in vars(self).items()
-                if name not in ("policy", "critic")
-            },
-            policy=PolicyConfig(
-                hidden=policy.hidden,
-                covariance=policy.covariance,  # pyright: ignore[reportArgumentType]
-                initial_std=policy.initial_std,
-                update=policy.update,  # pyright: ignore[reportArgumentType]
-                **policy.options,
-            ),
-            critic=CriticConfig(
-                hidden=critic.hidden,
-                kind=critic.kind,  # pyright: ignore[reportArgumentType]
-                target=critic.target,  # pyright: ignore[reportArgumentType]
-                **critic.options,
-                **critic.fit,
-            ),
-        )
+        policy = PolicyConfig(**_merged(self.policy))
+        critic = CriticConfig(**_merged(self.critic))
+        return Config(**{**vars(self), "policy": policy, "critic": critic})
 
 
 def resolve(config: Config | ResolvedConfig, algo: str | None = None) -> ResolvedConfig:
@@ -128,7 +100,7 @@ def resolve(config: Config | ResolvedConfig, algo: str | None = None) -> Resolve
         ConfigError: for the first setting that is invalid, alone or together with others.
     """
     if algo is not None and config.algo not in (None, algo):
-        raise ConfigError(f"algo {config.algo}: must be {algo} or unset", "algo")
+        raise invalid("algo", config.algo, f"{algo} or unset")
     if isinstance(config, ResolvedConfig):
         return config
     validation.check_types(config)
@@ -139,9 +111,9 @@ def resolve(config: Config | ResolvedConfig, algo: str | None = None) -> Resolve
     update, kind = policy.update or row.policy_update, critic.kind or row.critic
     options = lookup("policy.update", update, UPDATES)
     shape = lookup("critic.kind", kind, CRITICS)
-    used_by = f"{algo} (policy.update {update})"
-    validation.check_unused(used_by, "policy", policy, options, UPDATES)
+    validation.check_unused(f"{algo} (policy.update {update})", "policy", policy, options, UPDATES)
     validation.check_unused(f"{algo} (critic.kind {kind})", "critic", critic, shape, CRITICS)
+    target, fit = critic.target or row.target, _filled(critic, SGD)
     resolved = ResolvedConfig(
         **{name: getattr(config, name) for name in CommonConfig.__dataclass_fields__},
         env_version=config.env_version or spec.default_version,
@@ -151,21 +123,20 @@ def resolve(config: Config | ResolvedConfig, algo: str | None = None) -> Resolve
         policy=ResolvedPolicy(
             policy.hidden, policy.covariance, policy.initial_std, update, _filled(policy, options)
         ),
-        critic=ResolvedCritic(
-            critic.hidden,
-            kind,
-            critic.target or row.target,
-            _filled(critic, shape),
-            _filled(critic, SGD),
-        ),
+        critic=ResolvedCritic(critic.hidden, kind, target, _filled(critic, shape), fit),
     )
     validation.check(resolved.as_config(), spec)
     return resolved
 
 
-def _filled(settings: PolicyConfig | CriticConfig, defaults: Mapping[str, Any]) -> Options:
-    def chosen(name: str, default: Any) -> Any:
-        value = getattr(settings, name)
-        return default if value is None else value
+def _merged(settings: Settings) -> dict[str, Any]:
+    merged: dict[str, Any] = {}
+    for name, value in vars(settings).items():
+        merged |= value if isinstance(value, Options) else {name: value}
+    return merged
 
-    return Options(tuple((name, chosen(name, default)) for name, default in defaults.items()))
+
+def _filled(settings: Settings, defaults: Mapping[str, Any]) -> Options:
+    chosen = {name: getattr(settings, name) for name in defaults}
+    unset = {name: default for name, default in defaults.items() if chosen[name] is None}
+    return Options({**chosen, **unset})

@@ -10,6 +10,8 @@ from dgae_jax.configs.config import Config, ConfigError
 from dgae_jax.configs.resolved import ResolvedConfig
 from dgae_jax.configs.validation import check_types
 
+AnyConfig = Config | ResolvedConfig
+
 SCHEMA = 3
 """Version of the data. Schema 1 had no number, and its physics `mjx` is called `jax` now."""
 
@@ -28,7 +30,7 @@ MAY_CHANGE = ("total_steps", "physics")
 """Settings that may differ between a run and its continuation."""
 
 
-def to_dict(config: Config | ResolvedConfig) -> dict[str, Any]:
+def to_dict(config: AnyConfig) -> dict[str, Any]:
     """Return plain data with the number of the schema; what is unset or unused is None."""
     plain = config.as_config() if isinstance(config, ResolvedConfig) else config
     return {"schema": SCHEMA, **dataclasses.asdict(plain)}
@@ -46,11 +48,7 @@ def from_dict(data: Any) -> Config:
 
 
 def upgraded(data: Any) -> dict[str, Any]:
-    """Return the plain data of a configuration in today's names, without its schema.
-
-    Raises:
-        ConfigError: the data is no object, or of a schema that is not known.
-    """
+    """Return plain data in today's names without its schema; raise ConfigError if it is unknown."""
     if not isinstance(data, dict):
         raise ConfigError(f"configuration: must be an object, not {data!r}")
     schema = data.get("schema")
@@ -58,9 +56,8 @@ def upgraded(data: Any) -> dict[str, Any]:
         why = "before schema 2 the engine now called jax had the name mjx"
         raise ConfigError(f"schema: missing; {why}, which is MuJoCo's own now")
     if type(schema) is not int or schema not in (*RENAMED, SCHEMA):
-        raise ConfigError(
-            f"schema {schema}: must be one of {', '.join(map(str, (*RENAMED, SCHEMA)))}"
-        )
+        known = ", ".join(map(str, (*RENAMED, SCHEMA)))
+        raise ConfigError(f"schema {schema}: must be one of {known}")
     settings = {name: value for name, value in data.items() if name != "schema"}
     for version in range(schema, SCHEMA):
         settings = _renamed(settings, RENAMED[version])
@@ -68,16 +65,14 @@ def upgraded(data: Any) -> dict[str, Any]:
 
 
 def _renamed(settings: Mapping[str, Any], names: Mapping[str, str], prefix: str = "") -> dict:
-    def new(name: str) -> str:
-        return names.get(prefix + name, name).rpartition(".")[2]
-
-    return {
-        new(name): _renamed(value, names, f"{name}.") if isinstance(value, dict) else value
-        for name, value in settings.items()
-    }
+    renamed = {}
+    for name, value in settings.items():
+        new = names.get(prefix + name, name).rpartition(".")[2]
+        renamed[new] = _renamed(value, names, f"{name}.") if isinstance(value, dict) else value
+    return renamed
 
 
-def digest(config: Config | ResolvedConfig) -> str:
+def digest(config: AnyConfig) -> str:
     """Return a hash that configurations share which differ in nothing but their seeds."""
     plain = to_dict(dataclasses.replace(config, seed=0, num_seeds=1))
     return hashlib.sha256(json.dumps(plain, sort_keys=True).encode()).hexdigest()[:12]
@@ -87,15 +82,12 @@ def flat(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
     """Return the settings of plain data by their dotted paths."""
     out: dict[str, Any] = {}
     for name, value in values.items():
-        out |= (
-            flat(value, f"{prefix}{name}.") if isinstance(value, dict) else {prefix + name: value}
-        )
+        path = prefix + name
+        out |= flat(value, f"{path}.") if isinstance(value, dict) else {path: value}
     return out
 
 
-def differences(
-    one: Config | ResolvedConfig, two: Config | ResolvedConfig
-) -> dict[str, tuple[Any, Any]]:
+def differences(one: AnyConfig, two: AnyConfig) -> dict[str, tuple[Any, Any]]:
     """Return both values of every setting, by path, in which two configurations differ."""
     ours, theirs = flat(to_dict(one)), flat(to_dict(two))
     return {path: (x, theirs[path]) for path, x in ours.items() if x != theirs[path]}
@@ -107,9 +99,8 @@ def _built(cls: type, data: Any, prefix: str) -> Any:
     kinds = get_type_hints(cls)
     for name in sorted(set(data) ^ set(kinds)):
         raise ConfigError(f"{prefix}{name}: {'unknown' if name in data else 'missing'}")
-    values = {}
+    values = dict(data)
     for name, kind in kinds.items():
-        nested = dataclasses.is_dataclass(kind)
-        value, inner = data[name], f"{prefix}{name}."
-        values[name] = _built(kind, value, inner) if nested else value  # pyright: ignore
+        if dataclasses.is_dataclass(kind):
+            values[name] = _built(kind, data[name], f"{prefix}{name}.")  # pyright: ignore
     return cls(**values)

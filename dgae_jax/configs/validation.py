@@ -5,53 +5,58 @@ Values that are traced by JAX are not known yet and pass unchecked.
 
 import dataclasses
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 from dgae_jax.configs import parts
 from dgae_jax.configs.config import Config, ConfigError, Settings, invalid
 from dgae_jax.envs.registry import EnvSpec, spec_of
-from dgae_jax.maths.risk import check_metric
+from dgae_jax.maths import risk
 from dgae_jax.physics.registry import ENGINES, require
 
-INT32_MAX = 2**31 - 1
-"""The largest index and counter of a device."""
-
-WHOLE = {
-    "num_seeds": (1, 4096, "every one is a whole run in the same program"),
-    "total_steps": (1, INT32_MAX, "samples are counted in an int32"),
-    "num_envs": (1, INT32_MAX, "samples are indexed by an int32"),
-    "num_steps": (1, INT32_MAX, "samples are indexed by an int32"),
-    "episode_length": (1, INT32_MAX, "steps are counted in an int32"),
-    "policy.epochs": (1, 10_000, "more passes over one rollout only fit its noise"),
-    "policy.minibatches": (1, INT32_MAX, "samples are indexed by an int32"),
-    "policy.cg_iterations": (1, 1000, "conjugate gradient loses orthogonality in float32 before"),
-    "policy.max_backtracks": (0, 100, "a step halved more often is 0 in float32"),
-    "policy.fisher_every": (1, INT32_MAX, "samples are indexed by an int32"),
-    "critic.epochs": (1, 10_000, "more passes over one rollout only fit its noise"),
-    "critic.minibatches": (1, INT32_MAX, "samples are indexed by an int32"),
-    "critic.quantiles": (1, 10_000, "their residuals are K × K for every sample"),
-}
-"""Whole numbers: lowest, highest, and the reason for the highest."""
+INT32_MAX = 2**31 - 1  # the largest index and counter of a device
 
 MAX_LAYERS, MAX_WIDTH = 32, 65_536
-"""XLA compiles each layer by itself; one layer of this width has 17 GB of weights."""
 
-UNIT = ("gamma", "gae_lambda", "policy.learning_rate_end", "critic.learning_rate_end")
-"""Numbers from 0 to 1."""
 
-POSITIVE = (
-    "policy.clip_eps",
-    "policy.initial_std",
-    "policy.max_kl",
-    "policy.damping",
-    "policy.learning_rate",
-    "policy.max_grad_norm",
-    "critic.learning_rate",
-    "critic.max_grad_norm",
-    "critic.kappa",
-)
-"""Numbers above 0."""
+def _whole(low: int, high: int, reason: str) -> tuple[int, int, str]:
+    return low, high, f"a whole number from {low:,} to {high:,} ({reason})"
+
+
+UNIT = 0, 1, "a number from 0 to 1"
+POSITIVE = 1e-30, 1e30, "a number above 0, from 1e-30 to 1e30"
+SAMPLES = _whole(1, INT32_MAX, "samples are indexed by an int32")
+EPOCHS = _whole(1, 10_000, "more passes over one rollout only fit its noise")
+
+RANGES: dict[str, tuple[float, float, str]] = {
+    "num_seeds": _whole(1, 4096, "every one is a whole run in the same program"),
+    "total_steps": _whole(1, INT32_MAX, "samples are counted in an int32"),
+    "num_envs": SAMPLES,
+    "num_steps": SAMPLES,
+    "episode_length": _whole(1, INT32_MAX, "steps are counted in an int32"),
+    "gamma": UNIT,
+    "gae_lambda": UNIT,
+    "policy.initial_std": POSITIVE,
+    "policy.learning_rate": POSITIVE,
+    "policy.learning_rate_end": UNIT,
+    "policy.epochs": EPOCHS,
+    "policy.minibatches": SAMPLES,
+    "policy.max_grad_norm": POSITIVE,
+    "policy.clip_eps": POSITIVE,
+    "policy.max_kl": POSITIVE,
+    "policy.damping": POSITIVE,
+    "policy.cg_iterations": _whole(1, 1000, "in float32 it loses orthogonality before"),
+    "policy.max_backtracks": _whole(0, 100, "a step halved more often is 0 in float32"),
+    "policy.fisher_every": SAMPLES,
+    "critic.learning_rate": POSITIVE,
+    "critic.learning_rate_end": UNIT,
+    "critic.epochs": EPOCHS,
+    "critic.minibatches": SAMPLES,
+    "critic.max_grad_norm": POSITIVE,
+    "critic.quantiles": _whole(1, 10_000, "their residuals are K × K for every sample"),
+    "critic.kappa": POSITIVE,
+}
+"""Lowest and highest value of a number, and how an error message says so."""
 
 CHOICES = {
     "policy.covariance": parts.COVARIANCES,
@@ -87,9 +92,8 @@ def check_types(settings: Settings, prefix: str = "") -> None:
                 raise ConfigError(f"{path} {value!r}: must be {kind.__name__}", path)
             check_types(value, f"{path}.")
         elif not _has_type(value, kind):
-            plain = _plain(kind)
-            shown = getattr(get_origin(plain) or plain, "__name__", plain)
-            raise ConfigError(f"{path}: must be {shown}, not {value!r}", path)
+            plain = get_origin(_plain(kind)) or _plain(kind)
+            raise ConfigError(f"{path}: must be {plain.__name__}, not {value!r}", path)
 
 
 def _plain(kind: Any) -> Any:
@@ -122,21 +126,23 @@ def check_unused(
 def check(config: Config, spec: EnvSpec) -> None:
     """Raise ConfigError for the first invalid setting of a configuration that is filled in."""
     _check_task(config, spec)
-    _check_each(config)
+    for path, (low, high, allowed) in RANGES.items():
+        _require(config, path, lambda x: low <= x <= high, allowed)  # noqa: B023  called at once
+    for path, table in CHOICES.items():
+        _require(config, path, table.__contains__, f"one of {', '.join(table)}")
+    highest = 2**32 - config.num_seeds
+    allowed = f"a whole number from 0 to {highest:,} (seeds are numbers of 32 bits)"
+    _require(config, "seed", lambda seed: 0 <= seed <= highest, allowed)
     _check_networks(config)
     _check_metric(config)
     _check_samples(config)
 
 
-def _require(setting: str, value: Any, ok: bool, allowed: str) -> None:
-    if not ok:
-        raise invalid(setting, value, allowed)
-
-
-def _known(config: Config, path: str) -> Any:
-    """Return the value of a setting; None where it is unset or traced."""
+def _require(config: Config, path: str, ok: Callable[[Any], bool], allowed: str) -> None:
+    """Raise ConfigError unless a setting is valid, or unset or traced and so not known."""
     value = config.get(path)
-    return value if isinstance(value, int | float | str | tuple) else None
+    if isinstance(value, int | float | str | tuple) and not ok(value):
+        raise invalid(path, value, allowed)
 
 
 def _check_task(config: Config, spec: EnvSpec) -> None:
@@ -150,68 +156,44 @@ def _check_task(config: Config, spec: EnvSpec) -> None:
         lookup("env_version", config.env_version, dict.fromkeys(spec.versions))
     else:
         only = f"unset with {config.env}"
-        _require("env_version", config.env_version, config.env_version is None, only)
-        _require("noise.initial", config.noise.initial, config.noise.initial == 0, only)
-    for name, std in dataclasses.asdict(config.noise).items():
-        ok = std >= 0 and math.isfinite(std)
-        _require(f"noise.{name}", std, ok, "a finite number of at least 0")
-
-
-def _check_each(config: Config) -> None:
-    for path, (low, high, reason) in WHOLE.items():
-        if (value := _known(config, path)) is not None:
-            allowed = f"a whole number from {low:,} to {high:,} ({reason})"
-            _require(path, value, low <= value <= high, allowed)
-    for path in UNIT:
-        if (value := _known(config, path)) is not None:
-            _require(path, value, 0 <= value <= 1, "a number from 0 to 1")
-    for path in POSITIVE:
-        if (value := _known(config, path)) is not None:
-            _require(path, value, 1e-30 <= value <= 1e30, "a number above 0, from 1e-30 to 1e30")
-    for path, table in CHOICES.items():
-        if (value := _known(config, path)) is not None:
-            lookup(path, value, table)
-    highest = 2**32 - config.num_seeds
-    allowed = f"a whole number from 0 to {highest:,} (seeds are numbers of 32 bits)"
-    _require("seed", config.seed, 0 <= config.seed <= highest, allowed)
+        _require(config, "env_version", lambda version: False, only)
+        _require(config, "noise.initial", lambda std: std == 0, only)
+    for name in vars(config.noise):
+        allowed = "a finite number of at least 0"
+        _require(config, f"noise.{name}", lambda std: 0 <= std < math.inf, allowed)
 
 
 def _check_networks(config: Config) -> None:
+    width = f"widths of at most {MAX_WIDTH:,} (one layer of them has 17 GB of weights)"
+    layers = f"at most {MAX_LAYERS} (XLA compiles a thousand for half an hour)"
     for path in ("policy.hidden", "critic.hidden"):
-        hidden = config.get(path)
-        ok = len(hidden) >= 1 and min(hidden) >= 1
-        _require(path, hidden, ok, "one or more widths of at least 1")
-        allowed = f"widths of at most {MAX_WIDTH:,} (one layer of them has 17 GB of weights)"
-        _require(path, hidden, max(hidden) <= MAX_WIDTH, allowed)
-        if len(hidden) > MAX_LAYERS:
-            allowed = f"at most {MAX_LAYERS} (XLA compiles a thousand for half an hour)"
-            raise ConfigError(f"{path} of {len(hidden):,} layers: must be {allowed}", path)
+        _require(config, path, lambda x: min(x, default=0) >= 1, "one or more widths of at least 1")
+        _require(config, path, lambda x: max(x) <= MAX_WIDTH, width)
+        if (count := len(config.get(path))) > MAX_LAYERS:
+            raise ConfigError(f"{path} of {count:,} layers: must be {layers}", path)
 
 
 def _check_metric(config: Config) -> None:
     try:
-        check_metric(config.metric)
+        risk.parse(config.metric)
     except ValueError as allowed:
         raise invalid("metric", config.metric, str(allowed)) from None
     distribution = "quantiles" in parts.CRITICS[str(config.critic.kind)]
-    used = config.metric == "mean" or (config.residual == "distributional" and distribution)
-    allowed = f"mean with {config.algo}: other metrics need a distributional residual and quantiles"
-    _require("metric", config.metric, used, allowed)
-    ok = distribution or not config.diagnostics
-    _require("diagnostics", config.diagnostics, ok, "off: the critic is scalar")
+    if not (distribution and config.residual == "distributional"):
+        needs = "other metrics need a distributional residual and quantiles"
+        allowed = f"mean with {config.algo}: {needs}"
+        _require(config, "metric", lambda metric: metric == "mean", allowed)
+    if not distribution:
+        _require(config, "diagnostics", lambda on: not on, "off: the critic is scalar")
 
 
 def _check_samples(config: Config) -> None:
     samples = config.samples_per_iteration
+    of_samples = f"num_envs * num_steps = {samples:,}"
     allowed = f"such that num_envs * num_steps is at most {INT32_MAX:,}"
-    _require("num_envs", config.num_envs, samples <= INT32_MAX, allowed)
+    _require(config, "num_envs", lambda _: samples <= INT32_MAX, allowed)
     for path in ("policy.minibatches", "critic.minibatches"):
-        if (value := _known(config, path)) is not None:
-            allowed = f"a divisor of num_envs * num_steps = {samples:,}"
-            _require(path, value, samples % value == 0, allowed)
-    if (every := _known(config, "policy.fisher_every")) is not None:
-        allowed = f"at most num_envs * num_steps = {samples:,}"
-        _require("policy.fisher_every", every, every <= samples, allowed)
-    if (total := _known(config, "total_steps")) is not None:
-        allowed = f"at least one iteration of num_envs * num_steps = {samples:,} samples"
-        _require("total_steps", total, total >= samples, allowed)
+        _require(config, path, lambda n: samples % n == 0, f"a divisor of {of_samples}")
+    _require(config, "policy.fisher_every", lambda n: n <= samples, f"at most {of_samples}")
+    allowed = f"at least one iteration of {of_samples} samples"
+    _require(config, "total_steps", lambda total: total >= samples, allowed)

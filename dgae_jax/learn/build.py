@@ -25,6 +25,8 @@ from dgae_jax.learn.types import Algorithm, InferenceState, Policy, TrainState
 from dgae_jax.learn.updates import OPTIMIZERS, UPDATES, minibatch_update
 from dgae_jax.maths.risk import weights_of
 
+Infer = Callable[[InferenceState, jax.Array], jax.Array]
+
 TABLES: dict[str, tuple[dict[str, parts.Defaults], dict[str, Any]]] = {
     "update": (parts.UPDATES, UPDATES),
     "critic": (parts.CRITICS, CRITICS),
@@ -50,11 +52,7 @@ def register(kind: str, name: str, part: Any, settings: parts.Defaults | None = 
 
 
 def make_task(config: ResolvedConfig) -> Env:
-    """Return the environment that a configuration names, with its noise.
-
-    Raises:
-        ConfigError: it cannot be built.
-    """
+    """Return the env of a configuration with its noise; raise ConfigError if it cannot be built."""
     try:
         env = make_env(config.env, physics=config.physics, version=config.env_version)
     except (ValueError, TypeError) as reason:
@@ -108,11 +106,9 @@ def make_train(
 ) -> tuple[InitFn, TrainStep]:
     """Return `init(key) -> state` and `train_step(state) -> (state, metrics)`.
 
-    See `iteration.make_train`. Actions of an env without an `action_range` lie in [−1, 1].
-
     Args:
         algorithm: made by `make_algorithm`, or a record of your own parts.
-        env: the task.
+        env: the task; without an `action_range` its actions lie in [−1, 1].
         config: the run.
 
     Raises:
@@ -122,13 +118,7 @@ def make_train(
 
 
 def make_trainer(env: Env, capacity: int, mesh: Mesh | None = None) -> parallel.Trainer:
-    """Return the compiled programs of runs on `env`.
-
-    Args:
-        env: the task.
-        capacity: most iterations in one dispatch.
-        mesh: the devices that share the work (`devices.make_mesh`); by default there is one.
-    """
+    """Return the compiled programs of runs on `env`; see `parallel.make_trainer`."""
 
     def functions(config: ResolvedConfig) -> tuple[InitFn, TrainStep]:
         return make_train(make_algorithm(config.algo, env, config), env, config)
@@ -146,9 +136,7 @@ def policies_of(state: TrainState) -> InferenceState:
     return InferenceState(state.policy.params, state.obs_stats)
 
 
-def make_greedy(
-    env: Env, config: ResolvedConfig
-) -> Callable[[InferenceState, jax.Array], jax.Array]:
+def make_greedy(env: Env, config: ResolvedConfig) -> Infer:
     """Return `greedy(policy, obs [..., O]) -> action [..., A]`: the clipped mean action."""
     network, (low, high) = make_policy(env, config), env.action_range
 
@@ -160,9 +148,7 @@ def make_greedy(
     return greedy
 
 
-def make_quantiles(
-    env: Env, config: ResolvedConfig
-) -> Callable[[InferenceState, jax.Array], jax.Array]:
+def make_quantiles(env: Env, config: ResolvedConfig) -> Infer:
     """Return `quantiles(critic, obs [..., O]) -> [..., K]` of the scaled return."""
     network = make_algorithm(config.algo, env, config).critic
 
@@ -180,14 +166,9 @@ def _obs_size(env: Env) -> int:
 def _register_pytrees() -> None:
     """Make floats and the budget leaves, which may be traced; everything else is static."""
     nested = ("policy", "critic", "options", "fit")
-    for cls in (
-        user.PolicyConfig,
-        user.CriticConfig,
-        Config,
-        resolved.ResolvedPolicy,
-        resolved.ResolvedCritic,
-        ResolvedConfig,
-    ):
+    plain = user.PolicyConfig, user.CriticConfig, Config
+    complete = resolved.ResolvedPolicy, resolved.ResolvedCritic, ResolvedConfig
+    for cls in plain + complete:
         names = [f.name for f in dataclasses.fields(cls)]
         leaves = {*user.floats_of(cls), "total_steps", *nested}.intersection(names)
         jax.tree_util.register_dataclass(
@@ -195,19 +176,13 @@ def _register_pytrees() -> None:
         )
 
     def flatten(options: Options):
-        floats = tuple(value if _is_leaf(value) else None for _, value in options.pairs)
-        static = tuple((name, None if _is_leaf(x) else x) for name, x in options.pairs)
-        return floats, static
+        static = {name: x for name, x in options.items() if isinstance(x, int | str | tuple)}
+        return [{name: x for name, x in options.items() if name not in static}], Options(static)
 
-    def unflatten(static, floats):
-        pairs = zip(static, floats, strict=True)
-        return Options(tuple((name, leaf if x is None else x) for (name, x), leaf in pairs))
+    def unflatten(static: Options, floats):
+        return Options({**static, **floats[0]})
 
     jax.tree_util.register_pytree_node(Options, flatten, unflatten)
-
-
-def _is_leaf(value: Any) -> bool:
-    return not isinstance(value, int | str | tuple)
 
 
 _register_pytrees()

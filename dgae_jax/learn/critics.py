@@ -1,6 +1,7 @@
 """Critics: a network, a target and a loss. A scalar critic is one quantile and a squared error."""
 
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import NamedTuple
 
 import flax.linen as nn
@@ -58,6 +59,7 @@ TARGETS: dict[str, Target] = {
     "monte-carlo": Target(_sr_lambda, lam=1.0),
 }
 
+MakeTorso = Callable[[Sequence[int]], nn.Module]
 Error = Callable[[Array, Array, Array], Float[Array, " B"]]
 """`error(quantiles [B, K], target [B, J], value [B]) -> [B]`: loss of each sample."""
 
@@ -66,7 +68,7 @@ def _critic(
     obs_size: int,
     outputs: int,
     hidden: Sequence[int],
-    torso: Callable[[Sequence[int]], nn.Module],
+    torso: MakeTorso,
     target: Target,
     error: Error,
     head: Callable[[Array], Array] = jnp.asarray,
@@ -94,16 +96,9 @@ def scalar_critic(
     *,
     hidden: Sequence[int],
     target: Target,
-    torso: Callable[[Sequence[int]], nn.Module] = Torso,
+    torso: MakeTorso = Torso,
 ) -> Critic:
-    """Build V(s), fitted by half the squared error.
-
-    Args:
-        obs_size: length of an observation.
-        hidden: widths of the hidden layers.
-        target: target of the fit.
-        torso: flax module of the `hidden` layers.
-    """
+    """Build V(s), fitted by half the squared error."""
 
     def error(value: Array, target: Array, before: Array) -> Float[Array, " B"]:
         return 0.5 * ((value - target) ** 2).mean(-1)
@@ -118,18 +113,16 @@ def quantile_critic(
     target: Target,
     quantiles: int,
     kappa: ArrayLike,
-    torso: Callable[[Sequence[int]], nn.Module] = Torso,
+    torso: MakeTorso = Torso,
 ) -> Critic:
     """Build F⁻¹ of the return at K midpoints, fitted by the quantile-Huber loss.
-
-    The loss is Eq. quantile_huber_loss of the paper.
 
     Args:
         obs_size: length of an observation.
         hidden: widths of the hidden layers.
         target: target of the fit.
         quantiles: their number K.
-        kappa: threshold κ of the loss.
+        kappa: threshold κ of the loss (Eq. quantile_huber_loss).
         torso: flax module of the `hidden` layers.
     """
 
@@ -159,7 +152,7 @@ def ordered_critic(
     target: Target,
     quantiles: int,
     kappa: ArrayLike,
-    torso: Callable[[Sequence[int]], nn.Module] = Torso,
+    torso: MakeTorso = Torso,
 ) -> Critic:
     """Build F⁻¹ of the return at K `monotone_quantiles`; arguments as `quantile_critic`.
 
@@ -169,10 +162,8 @@ def ordered_critic(
 
     def error(quantiles: Array, target: Array, before: Array) -> Float[Array, " B"]:
         mean = quantiles.mean(-1)
-        shape = (
-            quantile_huber_loss(quantiles - mean[:, None], target - before[:, None], kappa=kappa)
-            / kappa
-        )
+        about, target_about = quantiles - mean[:, None], target - before[:, None]
+        shape = quantile_huber_loss(about, target_about, kappa=kappa) / kappa
         scale = quantiles.shape[-1] / 2  # of the quantile-Huber loss of K equal quantiles, Σᵢ τ̂ᵢ
         return scale * 0.5 * (mean - target.mean(-1)) ** 2 + SHAPE_LOSS_WEIGHT * shape
 
@@ -197,9 +188,7 @@ def td_error(weights: ArrayLike | None) -> Residual:
 
 def distributional_td_error(weights: ArrayLike | None) -> Residual:
     """Return the TD error under the metric of these weights (Def. distributional_TD_error)."""
-    return lambda reward, discount, quantiles, next_quantiles: distributional_td_residual(
-        reward, discount, quantiles, next_quantiles, weights
-    )
+    return partial(distributional_td_residual, weights=weights)
 
 
 RESIDUALS: dict[str, Callable[[ArrayLike | None], Residual]] = {

@@ -85,29 +85,22 @@ def divided(f: Callable, in_axes: tuple[int | None, ...], out_axes: Any) -> Call
     )
 
 
-def divide(tree: Any, axis: int = 0) -> Any:
-    """Divide every array of a tree along an axis, where that comes out even."""
+def divide(tree: Any, axis: int | None = 0) -> Any:
+    """Divide every array of a tree along an axis, where that comes out even; None to gather it."""
     mesh = _MESH.get()
     if mesh is None:
         return tree
-    return jax.tree.map(lambda x: _put(x, mesh, None if x.shape[axis] % mesh.size else axis), tree)
 
+    def put(x: jax.Array) -> jax.Array:
+        even = axis is not None and x.shape[axis] % mesh.size == 0
+        sharding = NamedSharding(mesh, _spec(axis if even else None))
+        return jax.lax.with_sharding_constraint(x, sharding)
 
-def gather(tree: Any) -> Any:
-    """Return the tree whole on every device."""
-    mesh = _MESH.get()
-    return tree if mesh is None else jax.tree.map(lambda x: _put(x, mesh, None), tree)
+    return jax.tree.map(put, tree)
 
 
 def concurrently(*tasks: tuple[Callable, tuple]) -> tuple[Any, ...]:
-    """Call independent functions: each on a CPU device of its own, or all on all accelerators.
-
-    Args:
-        tasks: functions and their arguments.
-
-    Returns:
-        Their results.
-    """
+    """Call `(function, arguments)`: each on a CPU device of its own, or all on all accelerators."""
     mesh = _MESH.get()
     if mesh is None or mesh.devices.flat[0].platform != "cpu":
         return tuple(f(*args) for f, args in tasks)
@@ -129,7 +122,3 @@ def concurrently(*tasks: tuple[Callable, tuple]) -> tuple[Any, ...]:
 
 def _spec(axis: int | None) -> PartitionSpec:
     return PartitionSpec() if axis is None else PartitionSpec(*[None] * axis, AXIS)
-
-
-def _put(x: jax.Array, mesh: Mesh, axis: int | None) -> jax.Array:
-    return jax.lax.with_sharding_constraint(x, NamedSharding(mesh, _spec(axis)))

@@ -1,10 +1,10 @@
 """Calibration of a critic: its quantiles against the returns that were observed."""
 
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array
 
 from dgae_jax.learn.types import Metrics
-from dgae_jax.maths.returns import bellman_target, lambda_return
+from dgae_jax.maths.returns import Quantiles, Steps, bellman_target, lambda_return
 from dgae_jax.maths.statistics import coverage, pit
 from dgae_jax.maths.transport import directional_metric, wasserstein
 
@@ -13,24 +13,18 @@ SIMILAR = 0.1
 
 
 def critic_diagnostics(
-    reward: Float[Array, "T N"],
-    discount: Float[Array, "T N"],
-    continues: Float[Array, "T N"],
-    quantiles: Float[Array, "T N K"],
-    next_quantiles: Float[Array, "T N K"],
+    reward: Steps,
+    discount: Steps,
+    continues: Steps,
+    quantiles: Quantiles,
+    next_quantiles: Quantiles,
 ) -> Metrics:
     """Compare a critic with Monte-Carlo returns.
 
     These are discounted sums to the end of the episode, or to the end of the rollout and the value
     there. `similar_means` is the share of steps with similar means and different shapes of target
-    and prediction, |d(r + γG′, G)| ≤ 0.1 W₁(r + γG′, G) (Sec. results).
-
-    Args:
-        reward: scaled rewards.
-        discount: γ(1 − terminated).
-        continues: 1 where the episode continues.
-        quantiles: predictions before each step.
-        next_quantiles: predictions after each step.
+    and prediction, |d(r + γG′, G)| ≤ 0.1 W₁(r + γG′, G) (Sec. results). `continues` is 1 where the
+    episode continues, and the other arguments are those of `maths.returns`.
     """
     returns = lambda_return(reward, discount, continues, quantiles, next_quantiles)
     probability = pit(quantiles, returns)
@@ -46,9 +40,7 @@ def critic_diagnostics(
     }
 
 
-def similar_means(
-    target: Float[Array, "*batch K"], quantiles: Float[Array, "*batch K"], share: float = SIMILAR
-) -> Bool[Array, "*batch"]:
+def similar_means(target: Quantiles, quantiles: Quantiles, share: float = SIMILAR) -> Array:
     """Return where distributions differ in shape rather than in mean, |d| ≤ share · W₁."""
     difference = jnp.abs(directional_metric(target, quantiles))
     return difference <= share * wasserstein(target, quantiles)

@@ -33,14 +33,8 @@ TrainStep = Callable[[TrainState], tuple[TrainState, Metrics]]
 def make_train(algorithm: Algorithm, env: Env, config: ResolvedConfig) -> tuple[InitFn, TrainStep]:
     """Return the pure functions of a run (Algorithm policy_value_update); jit, scan and vmap them.
 
-    Args:
-        algorithm: the parts.
-        env: the task; its `action_range` bounds the actions.
-        config: the run; γ and λ may be traced.
-
-    Returns:
-        `init(key) -> state` and `train_step(state) -> (state, metrics)`; a step consumes
-        `num_envs * num_steps` samples.
+    The env has an `action_range`, which bounds the actions. γ and λ may be traced. A step consumes
+    `num_envs * num_steps` samples.
     """
     num_envs, gamma = config.num_envs, config.gamma
     obs_size = int(env.observation_size)  # pyright: ignore[reportArgumentType]
@@ -68,9 +62,8 @@ def make_train(algorithm: Algorithm, env: Env, config: ResolvedConfig) -> tuple[
         reward_scale, reward, obs_stats = state.reward_scale, step.reward, state.obs_stats
         if config.normalize_rewards:
             done = (step.terminated | step.truncated).astype(reward.dtype)
-            reward_scale, reward = normalizers.scale_rewards(
-                reward_scale, reward, done, step.mask, gamma
-            )
+            scaled = normalizers.scale_rewards(reward_scale, reward, done, step.mask, gamma)
+            reward_scale, reward = scaled
         batch, estimates = _estimate(algorithm, state, step, reward, target_key, config)
         (new_policy, policy_info), (new_critic, critic_info) = devices.concurrently(
             (algorithm.policy_update.step, (policy_key, state.policy, batch)),
@@ -83,18 +76,18 @@ def make_train(algorithm: Algorithm, env: Env, config: ResolvedConfig) -> tuple[
         updated = policy_finite & critic_finite
         failures = jnp.where(updated & (step.mask.mean() >= 0.5), 0, state.failures + 1)
         metrics = {
-            **_episode_metrics(episodes, step),
+            "episode_return": jnp.nanmean(episodes.last_total),  # in rewards that are not scaled
+            "episode_length": jnp.nanmean(episodes.last_steps),
+            "episodes": (step.terminated | step.truncated).sum(),
+            "reward": step.reward.mean(),
             "nonfinite": (episodes.nonfinite - state.episodes.nonfinite).sum(),
             "skipped": 1.0 - updated,
             **{f"policy/{name}": value for name, value in policy_info.items()},
             **{f"critic/{name}": value for name, value in critic_info.items()},
             **estimates,
         }
-        iteration = state.iteration + 1
-        state = TrainState(
-            policy, critic, obs_stats, reward_scale, episodes, key, iteration, failures
-        )
-        return state, metrics
+        progress = key, state.iteration + 1, failures
+        return TrainState(policy, critic, obs_stats, reward_scale, episodes, *progress), metrics
 
     return init, train_step
 
@@ -108,24 +101,18 @@ def _skip_nonfinite(
 
 
 def _roll_out(
-    env: Env,
-    algorithm: Algorithm,
-    state: TrainState,
-    keys: Key[Array, "T N"],
-    episode_length: int,
+    env: Env, algorithm: Algorithm, state: TrainState, keys: Key[Array, "T N"], episode_length: int
 ) -> tuple[Episodes, Transition]:
     """Roll out the envs of each device on that device, and gather the data on all."""
 
-    def own_envs(
-        actor: InferenceState, episodes: Episodes, keys: Key[Array, "T n"]
-    ) -> tuple[Episodes, Transition]:
+    def own_envs(actor: InferenceState, episodes: Episodes, keys: Key[Array, "T n"]):
         act = sampler(algorithm.policy, actor)
         return rollout(env, act, episodes, keys, episode_length=episode_length)
 
     actor = InferenceState(state.policy.params, state.obs_stats)
     per_device = devices.divided(own_envs, (None, 0, 1), (0, 1))
     episodes, step = per_device(actor, state.episodes, keys)
-    return episodes, devices.gather(step)
+    return episodes, devices.divide(step, axis=None)
 
 
 def sampler(policy: Policy, actor: InferenceState) -> Act:
@@ -178,18 +165,7 @@ def _estimate(
         "critic/explained_variance": explained_variance(value, returns),
     }
     if config.diagnostics:
+        predictions = quantiles, next_quantiles
         continues = 1.0 - (step.terminated | step.truncated)
-        metrics |= diagnostics.critic_diagnostics(
-            reward, discount, continues, quantiles, next_quantiles
-        )
+        metrics |= diagnostics.critic_diagnostics(reward, discount, continues, *predictions)
     return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), batch), metrics
-
-
-def _episode_metrics(episodes: Episodes, step: Transition) -> Metrics:
-    """Return the returns and lengths of the last episodes, in rewards that are not scaled."""
-    return {
-        "episode_return": jnp.nanmean(episodes.last_total),
-        "episode_length": jnp.nanmean(episodes.last_steps),
-        "episodes": (step.terminated | step.truncated).sum(),
-        "reward": step.reward.mean(),
-    }

@@ -5,7 +5,7 @@ that the first actions are noise around zero (Andrychowicz et al. 2021).
 """
 
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import flax.linen as nn
 import jax.numpy as jnp
@@ -66,9 +66,8 @@ class SharedCovariance(nn.Module):
     @nn.compact
     def __call__(self, obs: Float[Array, "*batch O"]) -> Gaussian:
         mean = _dense(self.actions, 0.01)(self.torso(self.hidden)(obs))
-        log_std = self.param(
-            "log_std", nn.initializers.constant(jnp.log(self.initial_std)), (self.actions,)
-        )
+        initial = nn.initializers.constant(jnp.log(self.initial_std))
+        log_std = self.param("log_std", initial, (self.actions,))
         return Gaussian(mean, jnp.broadcast_to(log_std, mean.shape))
 
 
@@ -94,6 +93,10 @@ COVARIANCES: dict[str, Callable[..., nn.Module]] = {
 }
 
 
+def _functions(module: nn.Module, obs_size: int) -> tuple[Init, Callable[..., Any]]:
+    return lambda key: module.init(key, jnp.zeros(obs_size)), module.apply
+
+
 def gaussian_policy(
     obs_size: int,
     action_size: int,
@@ -104,18 +107,10 @@ def gaussian_policy(
 ) -> Policy:
     """Build a Gaussian policy with diagonal covariance (Sec. results, set-up).
 
-    Args:
-        obs_size: length of an observation.
-        action_size: length of an action.
-        hidden: widths of the hidden layers.
-        covariance: a module of `hidden`, `actions` and `initial_std` that returns a Gaussian.
-        initial_std: standard deviation of the first actions.
+    `covariance` is a module of `hidden`, `actions` and `initial_std`, σ of the first actions; it
+    returns a Gaussian.
     """
-    module = covariance(tuple(hidden), action_size, initial_std)
-    return Policy(
-        lambda key: module.init(key, jnp.zeros(obs_size)),
-        lambda params, obs: module.apply(params, obs),  # pyright: ignore[reportArgumentType]
-    )
+    return Policy(*_functions(covariance(tuple(hidden), action_size, initial_std), obs_size))
 
 
 def value_network(
@@ -128,15 +123,6 @@ def value_network(
 ) -> Network:
     """Build a network with one scalar or K quantiles as outputs (Sec. results, set-up).
 
-    Args:
-        obs_size: length of an observation.
-        outputs: number of outputs.
-        hidden: widths of the hidden layers.
-        torso: flax module of the `hidden` layers.
-        bias: initial biases of the head.
+    `torso` is a module of the `hidden` layers, and `bias` initializes the biases of the head.
     """
-    module = Value(tuple(hidden), outputs, torso, bias)
-    return Network(
-        lambda key: module.init(key, jnp.zeros(obs_size)),
-        lambda params, obs: module.apply(params, obs),  # pyright: ignore[reportArgumentType]
-    )
+    return Network(*_functions(Value(tuple(hidden), outputs, torso, bias), obs_size))

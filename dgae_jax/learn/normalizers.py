@@ -17,10 +17,12 @@ OBSERVATION_LIMIT = 10.0
 """Normalized observations are clipped to ±10 standard deviations."""
 
 MAX_EXTREMES = 20
-"""Most values that are left out at either end of the first rollout, so that finding them is cheap.
-"""
+"""Most values left out at either end of the first rollout, so that finding them is cheap."""
 
 Statistics = running_statistics.RunningStatisticsState
+Observations = Float[Array, "*batch O"]
+Rollout = Float[Array, "T N *F"]
+Mask = Bool[Array, "T N"]
 
 
 class RewardScale(NamedTuple):
@@ -39,16 +41,12 @@ def init_obs_stats(size: int) -> Statistics:
     return running_statistics.init_state(jnp.zeros(size))
 
 
-def update_obs_stats(
-    statistics: Statistics, obs: Float[Array, "T N O"], mask: Bool[Array, "T N"]
-) -> Statistics:
+def update_obs_stats(statistics: Statistics, obs: Rollout, mask: Mask) -> Statistics:
     """Return the statistics with the unmasked observations of a rollout, for the next iteration."""
     return _update(statistics, _bounded(statistics, obs), mask)
 
 
-def normalize(
-    statistics: Statistics | None, obs: Float[Array, "*batch O"]
-) -> Float[Array, "*batch O"]:
+def normalize(statistics: Statistics | None, obs: Observations) -> Observations:
     """Return (obs − mean) / standard deviation, clipped; `obs` itself without statistics."""
     if statistics is None:
         return obs
@@ -65,7 +63,7 @@ def scale_rewards(
     scale: RewardScale,
     reward: Float[Array, "T N"],
     done: Float[Array, "T N"],
-    mask: Bool[Array, "T N"],
+    mask: Mask,
     gamma: ArrayLike,
 ) -> tuple[RewardScale, Float[Array, "T N"]]:
     """Update the scale with a rollout and divide the rollout's rewards by it.
@@ -86,13 +84,11 @@ def scale_rewards(
     return updated, reward / jnp.asarray(returns.std)
 
 
-def _update(
-    statistics: Statistics, rollout: Float[Array, "T N *F"], mask: Bool[Array, "T N"]
-) -> Statistics:
+def _update(statistics: Statistics, rollout: Rollout, mask: Mask) -> Statistics:
     return running_statistics.update(statistics, rollout, weights=mask.astype(rollout.dtype))
 
 
-def _bounded(statistics: Statistics, rollout: Float[Array, "T N *F"]) -> Float[Array, "T N *F"]:
+def _bounded(statistics: Statistics, rollout: Rollout) -> Rollout:
     """Clip each sample to the mean ± the root of the sum of squares of all earlier samples.
 
     Where that sum is 0 (no samples, or equal ones) the rollout without its lowest and highest
@@ -113,8 +109,6 @@ def _bounded(statistics: Statistics, rollout: Float[Array, "T N *F"]) -> Float[A
         return center, ((rollout - center) ** 2).sum((0, 1), where=usual)
 
     first = jax.lax.cond((squares > 0).all(), lambda: (mean, squares), from_rollout)
-    mean, squares = (
-        jnp.where(squares > 0, *pair) for pair in ((mean, first[0]), (squares, first[1]))
-    )
+    mean, squares = (jnp.where(squares > 0, *x) for x in zip((mean, squares), first, strict=True))
     limit = jnp.where(squares > 0, jnp.sqrt(squares), jnp.inf)
     return jnp.clip(rollout, mean - limit, mean + limit)

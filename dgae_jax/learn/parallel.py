@@ -39,7 +39,7 @@ def make_trainer(
     Args:
         make_train: returns `init` and `train_step`; traced leaves may change between calls.
         capacity: most iterations in one dispatch.
-        mesh: the devices that share the work; by default there is one.
+        mesh: the devices that share the work (`devices.make_mesh`); by default there is one.
     """
 
     @partial(jax.jit, compiler_options=COMPILER_OPTIONS)

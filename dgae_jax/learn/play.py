@@ -23,9 +23,8 @@ class Play(NamedTuple):
 
 def begin(state: Any) -> Play:
     """Return the episodes that begin in these env states, which have a leading axis."""
-    return Play(
-        state, jnp.zeros_like(state.reward), jnp.full(state.reward.shape, True), jnp.int32(0)
-    )
+    zeros = jnp.zeros_like(state.reward)
+    return Play(state, zeros, jnp.full(zeros.shape, True), jnp.int32(0))
 
 
 def play(env: Env, act: Callable[[Array], Array], episodes: Play, until: ArrayLike) -> Play:

@@ -60,23 +60,13 @@ def finite(tree: Any) -> Bool[Array, " N"]:
     return jnp.stack([jnp.isfinite(x).reshape(x.shape[0], -1).all(1) for x in leaves]).all(0)
 
 
-def _masked(step: Transition, mask: Bool[Array, " N"]) -> Transition:
+def _masked(step: Transition) -> Transition:
     """Make every number finite: a masked step has no action or reward and stays where it was."""
     obs = jnp.where(jnp.isfinite(step.obs), step.obs, 0)
-    action, log_prob, reward = (
-        jnp.where(_like(mask, x), x, 0) for x in (step.action, step.log_prob, step.reward)
-    )
-    next_obs = jnp.where(mask[:, None], step.next_obs, obs)
-    return step._replace(
-        obs=obs, action=action, log_prob=log_prob, reward=reward, next_obs=next_obs
-    )
-
-
-def _record(episodes: Episodes, attempt: Any, mask: Bool[Array, " N"]) -> Episodes:
-    """Count masked steps, and keep the state before and the action of the last one."""
-    return episodes._replace(
-        nonfinite=episodes.nonfinite + ~mask, incident=where(mask, episodes.incident, attempt)
-    )
+    numbers = {name: getattr(step, name) for name in ("action", "log_prob", "reward")}
+    kept = {name: jnp.where(_like(step.mask, x), x, 0) for name, x in numbers.items()}
+    next_obs = jnp.where(step.mask[:, None], step.next_obs, obs)
+    return step._replace(obs=obs, next_obs=next_obs, **kept)
 
 
 def ends(state: Any, late: Bool[Array, " N"]) -> tuple[Bool[Array, " N"], Bool[Array, " N"]]:
@@ -96,13 +86,11 @@ def _advance(episodes: Episodes, after: Any, step: Transition, fresh: Episodes) 
     """Return the envs after a step; where the episode ended, a fresh one begins."""
     done = step.terminated | step.truncated
     steps, total = episodes.steps + 1, episodes.total + step.reward
-    state, now_steps, now_total = where(
-        done, (fresh.env, fresh.steps, fresh.total), (after, steps, total)
-    )
+    now = where(done, (fresh.env, fresh.steps, fresh.total), (after, steps, total))
     return episodes._replace(
-        env=state,
-        steps=now_steps,
-        total=now_total,
+        env=now[0],
+        steps=now[1],
+        total=now[2],
         last_total=jnp.where(done, total, episodes.last_total),
         last_steps=jnp.where(done, steps, episodes.last_steps),
     )
@@ -142,8 +130,9 @@ def rollout(
         step = Transition(
             before.obs, action, log_prob, after.reward, terminated, truncated, after.obs, mask
         )
-        step = _masked(step, mask)
-        episodes = _record(episodes, (before.pipeline_state, action), mask)
+        step = _masked(step)
+        incident = where(mask, episodes.incident, (before.pipeline_state, action))
+        episodes = episodes._replace(nonfinite=episodes.nonfinite + ~mask, incident=incident)
         again = jax.vmap(partial(restart, env))(after, reset_keys, terminated | truncated)
         return _advance(episodes, after, step, _begin(env, again)), step
 

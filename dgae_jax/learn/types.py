@@ -9,6 +9,7 @@ from typing import Any, NamedTuple, Protocol, runtime_checkable
 from jaxtyping import Array, Bool, Float, Int, Key
 
 from dgae_jax.maths.gaussian import Gaussian
+from dgae_jax.maths.returns import Quantiles, Steps
 
 Params = Any
 """A pytree of network parameters."""
@@ -62,7 +63,6 @@ class InferenceState(NamedTuple):
 
     params: Params
     obs_stats: Any
-    """Running mean and standard deviation of observations; None if they are not normalized."""
 
 
 class TrainState(NamedTuple):
@@ -93,16 +93,14 @@ class Init(Protocol):
 class ApplyPolicy(Protocol):
     """Distribution over actions [..., A] in observations [..., O]."""
 
-    def __call__(self, params: Params, obs: Float[Array, "*batch O"]) -> Gaussian: ...
+    def __call__(self, params: Params, obs: Float[Array, "*steps O"]) -> Gaussian: ...
 
 
 @runtime_checkable
 class Predict(Protocol):
     """Quantiles [..., K] of the return from observations [..., O]; K = 1 for a scalar critic."""
 
-    def __call__(
-        self, params: Params, obs: Float[Array, "*batch O"]
-    ) -> Float[Array, "*batch K"]: ...
+    def __call__(self, params: Params, obs: Float[Array, "*steps O"]) -> Quantiles: ...
 
 
 @runtime_checkable
@@ -115,12 +113,12 @@ class TargetFn(Protocol):
     def __call__(
         self,
         key: Key[Array, ""] | None,
-        reward: Float[Array, "T *N"],
-        discount: Float[Array, "T *N"],
-        trace: Float[Array, "T *N"] | None,
-        quantiles: Float[Array, "T *N K"] | None,
-        next_quantiles: Float[Array, "T *N K"],
-    ) -> Float[Array, "T *N J"]: ...
+        reward: Steps,
+        discount: Steps,
+        trace: Steps | None,
+        quantiles: Quantiles | None,
+        next_quantiles: Quantiles,
+    ) -> Float[Array, "*steps J"]: ...
 
 
 @runtime_checkable
@@ -135,12 +133,8 @@ class Residual(Protocol):
     """TD error δ from the predictions before and after each step: the part that DGAE changes."""
 
     def __call__(
-        self,
-        reward: Float[Array, "T N"],
-        discount: Float[Array, "T N"],
-        quantiles: Float[Array, "T N K"],
-        next_quantiles: Float[Array, "T N K"],
-    ) -> Float[Array, "T N"]: ...
+        self, reward: Steps, discount: Steps, quantiles: Quantiles, next_quantiles: Quantiles
+    ) -> Steps: ...
 
 
 @runtime_checkable

@@ -1,6 +1,7 @@
 """Updates of parameters: the surrogate objective, minibatch gradient descent, the trust region."""
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import jax
@@ -27,11 +28,7 @@ def surrogate(policy: Policy, clip_eps: ArrayLike = jnp.inf) -> Loss:
     """Return the clipped surrogate loss −E[min(ρA, clip(ρ, 1 ± ε)A)] (Schulman et al. 2017).
 
     ρ = π(a|s)/π_old(a|s), bounded by `LOG_RATIO_LIMIT`. At the policy that acted the gradient is
-    that of −E[A log π] (Eq. gradient_obj_fcn).
-
-    Args:
-        policy: the policy network.
-        clip_eps: clip range ε; infinite for the plain surrogate ρA.
+    that of −E[A log π] (Eq. gradient_obj_fcn). With an infinite ε it is the plain surrogate ρA.
     """
 
     def loss(params: Params, batch: Batch):
@@ -170,17 +167,10 @@ def fisher_product(
     return product
 
 
-def adam(rate) -> optax.GradientTransformation:
-    """Adam with the ε of the implementations of PPO (Andrychowicz et al. 2021)."""
-    return optax.adam(rate, eps=1e-5)
-
-
-def rmsprop(rate) -> optax.GradientTransformation:
-    """RMSProp as in stable-baselines3's A2C."""
-    return optax.rmsprop(rate, decay=0.99, eps=1e-5, eps_in_sqrt=False)
-
-
-OPTIMIZERS: dict[str, Optimizer] = {"adam": adam, "rmsprop": rmsprop}
+OPTIMIZERS: dict[str, Optimizer] = {
+    "adam": partial(optax.adam, eps=1e-5),  # as implementations of PPO (Andrychowicz et al. 2021)
+    "rmsprop": partial(optax.rmsprop, decay=0.99, eps=1e-5, eps_in_sqrt=False),  # as sb3's A2C
+}
 
 
 def linear_schedule(
@@ -188,11 +178,7 @@ def linear_schedule(
 ) -> optax.Schedule:
     """Return a schedule from `start` linearly to `end_fraction` of it, constant afterwards.
 
-    Args:
-        start: value at the start; may be traced, as the next two.
-        end_fraction: value at the end over that at the start.
-        steps: length of the schedule.
-        decay_start: share of the steps before the decay begins.
+    It lasts for `steps`, and the decay begins after the share `decay_start` of them.
     """
 
     def schedule(count: ArrayLike) -> Array:
@@ -200,14 +186,6 @@ def linear_schedule(
         return jnp.multiply(start, 1 + (end_fraction - 1) * done)
 
     return schedule
-
-
-def make_optimizer(
-    optimizer: Optimizer, learning_rate: ArrayLike, *, end_fraction, gradient_steps, max_grad_norm
-) -> optax.GradientTransformation:
-    """Return an optimizer behind a global-norm clip, on a linear schedule over the run."""
-    schedule = linear_schedule(learning_rate, end_fraction, gradient_steps)
-    return optax.chain(optax.clip_by_global_norm(max_grad_norm), optimizer(schedule))
 
 
 def minibatch_update(
@@ -223,23 +201,12 @@ def minibatch_update(
 ) -> Update:
     """Return `sgd` on a loss, with a learning rate that decays over a run of `iterations`.
 
-    Args:
-        loss: the loss of a minibatch.
-        iterations: iterations of the run.
-        optimizer: a name in `OPTIMIZERS`.
-        learning_rate: learning rate at the start.
-        learning_rate_end: learning rate at the end over that at the start.
-        epochs: passes over each batch.
-        minibatches: gradient steps per pass.
-        max_grad_norm: largest global norm of a gradient.
+    The options are the settings of the same names in `configs.config.FitConfig`.
     """
-    rule = make_optimizer(
-        OPTIMIZERS[optimizer],
-        learning_rate,
-        end_fraction=learning_rate_end,
-        gradient_steps=iterations * epochs * minibatches,
-        max_grad_norm=max_grad_norm,
-    )
+    steps = iterations * epochs * minibatches
+    schedule = linear_schedule(learning_rate, learning_rate_end, steps)
+    clip = optax.clip_by_global_norm(max_grad_norm)
+    rule = optax.chain(clip, OPTIMIZERS[optimizer](schedule))
     return sgd(loss, rule, epochs=epochs, minibatches=minibatches)
 
 

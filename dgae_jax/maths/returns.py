@@ -19,14 +19,16 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Key, Shaped
 
 from dgae_jax.maths.transport import directional_metric
 
-Mask = Bool[Array, "T *batch"] | Float[Array, "T *batch"]
+Steps = Float[Array, "*steps"]
+Quantiles = Float[Array, "*steps K"]
+Mask = Bool[Array, "*steps"] | Steps
 
 
 class Decay(NamedTuple):
     """Factors of the bootstrap, γ(1 − terminated), and of the trace, λ(1 − done)."""
 
-    discount: Float[Array, "T *batch"]
-    trace: Float[Array, "T *batch"]
+    discount: Steps
+    trace: Steps
 
 
 def decay(terminated: Mask, truncated: Mask, *, gamma: ArrayLike, lam: ArrayLike) -> Decay:
@@ -38,19 +40,10 @@ def decay(terminated: Mask, truncated: Mask, *, gamma: ArrayLike, lam: ArrayLike
     )
 
 
-def lambda_sum(
-    delta: Float[Array, "T *batch"], factor: Float[Array, "T *batch"]
-) -> Float[Array, "T *batch"]:
+def lambda_sum(delta: Steps, factor: Steps) -> Steps:
     """Compute Aₜ = δₜ + factorₜ Aₜ₊₁ with A_T = 0 (Theorem, Eq. gae_final).
 
-    Within an episode it is Σₖ (γλ)ᵏ δₜ₊ₖ.
-
-    Args:
-        delta: TD errors δ [T, ...].
-        factor: γλ(1 − done) [T, ...].
-
-    Returns:
-        Advantages [T, ...].
+    With factor = γλ(1 − done) it is Σₖ (γλ)ᵏ δₜ₊ₖ within an episode.
     """
 
     def backward(advantage, step):
@@ -61,41 +54,35 @@ def lambda_sum(
     return jax.lax.scan(backward, jnp.zeros_like(delta[0]), (delta, factor), reverse=True)[1]
 
 
-def td_residual(
-    reward: Float[Array, "*batch"],
-    discount: Float[Array, "*batch"],
-    value: Float[Array, "*batch"],
-    next_value: Float[Array, "*batch"],
-) -> Float[Array, "*batch"]:
+def td_residual(reward: Steps, discount: Steps, value: Steps, next_value: Steps) -> Steps:
     """Compute the TD error δ = r + γ V(s′) − V(s) (below Eq. GAE)."""
     return reward + discount * next_value - value
 
 
 def distributional_td_residual(
-    reward: Float[Array, "*batch"],
-    discount: Float[Array, "*batch"],
-    quantiles: Float[Array, "*batch K"],
-    next_quantiles: Float[Array, "*batch K"],
+    reward: Steps,
+    discount: Steps,
+    quantiles: Quantiles,
+    next_quantiles: Quantiles,
     weights: ArrayLike | None = None,
-) -> Float[Array, "*batch"]:
+) -> Steps:
     """Compute the distributional TD error r + d(γ G(s′), G(s)) (Def. distributional_TD_error).
 
-    Returns:
-        TD errors δ [...]; for `weights` see `transport.directional_metric`.
+    `weights` are those of `transport.directional_metric`.
     """
     return reward + directional_metric(discount[..., None] * next_quantiles, quantiles, weights)
 
 
 def gae(
-    reward: Float[Array, "T *batch"],
-    value: Float[Array, "T *batch"],
-    next_value: Float[Array, "T *batch"],
+    reward: Steps,
+    value: Steps,
+    next_value: Steps,
     terminated: Mask,
     truncated: Mask,
     *,
     gamma: ArrayLike,
     lam: ArrayLike,
-) -> Float[Array, "T *batch"]:
+) -> Steps:
     """Compute Â = Σₖ (γλ)ᵏ δₜ₊ₖ with the scalar TD error (Eq. GAE; Schulman et al. 2016).
 
     Args:
@@ -115,16 +102,16 @@ def gae(
 
 
 def dgae(
-    reward: Float[Array, "T *batch"],
-    quantiles: Float[Array, "T *batch K"],
-    next_quantiles: Float[Array, "T *batch K"],
+    reward: Steps,
+    quantiles: Quantiles,
+    next_quantiles: Quantiles,
     terminated: Mask,
     truncated: Mask,
     *,
     gamma: ArrayLike,
     lam: ArrayLike,
     weights: ArrayLike | None = None,
-) -> Float[Array, "T *batch"]:
+) -> Steps:
     """Compute Â_DGAE = Σₖ (γλ)ᵏ δ^Ĝₜ₊ₖ with the distributional TD error (Theorem, Eq. gae_final).
 
     With the paper's L(x) = x (`weights=None`) this equals `gae` on the means of the quantiles.
@@ -150,23 +137,20 @@ def dgae(
 
 
 def n_step_advantage(
-    reward: Float[Array, "T *batch"],
-    quantiles: Float[Array, "T *batch K"],
-    next_quantiles: Float[Array, "T *batch K"],
+    reward: Steps,
+    quantiles: Quantiles,
+    next_quantiles: Quantiles,
     terminated: Mask,
     truncated: Mask,
     *,
     gamma: ArrayLike,
     n: int,
     weights: ArrayLike | None = None,
-) -> Float[Array, "T *batch"]:
+) -> Steps:
     """Compute Â⁽ⁿ⁾ = d(Σₖ₍ₖ<ₙ₎ γᵏ rₜ₊ₖ + γⁿ Ĝ(sₜ₊ₙ), Ĝ(sₜ)) (Def. k_step_estimator).
 
     A trajectory that ends earlier, by episode or rollout, uses the steps that it has.
     Arguments are those of `dgae`, and the number of steps n ≥ 1.
-
-    Returns:
-        Advantages [T, ...].
     """
     if n < 1:
         raise ValueError(f"the number of steps n is {n}; it must be at least 1")
@@ -183,48 +167,24 @@ def n_step_advantage(
 # ---- critic targets, from predictions of the critic at rollout time ----
 
 
-def bellman_target(
-    reward: Float[Array, "*batch"],
-    discount: Float[Array, "*batch"],
-    next_quantiles: Float[Array, "*batch K"],
-) -> Float[Array, "*batch K"]:
-    """Compute 𝒯G(s) = r + γ G(s′), atom by atom (Eq. G_dis_bellman; Lemma lemma1 with η = γ).
-
-    Returns:
-        Targets [..., K].
-    """
+def bellman_target(reward: Steps, discount: Steps, next_quantiles: Quantiles) -> Quantiles:
+    """Compute 𝒯G(s) = r + γ G(s′), atom by atom (Eq. G_dis_bellman; Lemma lemma1 with η = γ)."""
     return reward[..., None] + discount[..., None] * next_quantiles
 
 
 def lambda_return(
-    reward: Float[Array, "T *batch"],
-    discount: Float[Array, "T *batch"],
-    trace: Float[Array, "T *batch"],
-    quantiles: Float[Array, "T *batch K"],
-    next_quantiles: Float[Array, "T *batch K"],
-) -> Float[Array, "T *batch"]:
-    """Compute the λ-return G^λ = V + Â_GAE, V the mean of the quantiles (Schulman et al. 2016).
-
-    Returns:
-        λ-returns [T, ...].
-    """
+    reward: Steps, discount: Steps, trace: Steps, quantiles: Quantiles, next_quantiles: Quantiles
+) -> Steps:
+    """Compute the λ-return G^λ = V + Â_GAE, V the mean of the quantiles (Schulman et al. 2016)."""
     value = quantiles.mean(-1)
     delta = td_residual(reward, discount, value, next_quantiles.mean(-1))
     return value + lambda_sum(delta, discount * trace)
 
 
 def lambda_shift_target(
-    reward: Float[Array, "T *batch"],
-    discount: Float[Array, "T *batch"],
-    trace: Float[Array, "T *batch"],
-    quantiles: Float[Array, "T *batch K"],
-    next_quantiles: Float[Array, "T *batch K"],
-) -> Float[Array, "T *batch K"]:
-    """Compute 𝒯G − E[𝒯G] + G^λ, the one-step target shifted to the mean of the λ-return.
-
-    Returns:
-        Targets [T, ..., K].
-    """
+    reward: Steps, discount: Steps, trace: Steps, quantiles: Quantiles, next_quantiles: Quantiles
+) -> Quantiles:
+    """Compute 𝒯G − E[𝒯G] + G^λ, the one-step target shifted to the mean of the λ-return."""
     one_step = bellman_target(reward, discount, next_quantiles)
     mean = lambda_return(reward, discount, trace, quantiles, next_quantiles)
     return one_step - one_step.mean(-1, keepdims=True) + mean[..., None]
@@ -232,18 +192,15 @@ def lambda_shift_target(
 
 def sr_lambda_target(
     key: Key[Array, ""] | Shaped[Array, "2"],
-    reward: Float[Array, "T *batch"],
-    discount: Float[Array, "T *batch"],
-    trace: Float[Array, "T *batch"],
-    next_quantiles: Float[Array, "T *batch K"],
-) -> Float[Array, "T *batch K"]:
+    reward: Steps,
+    discount: Steps,
+    trace: Steps,
+    next_quantiles: Quantiles,
+) -> Quantiles:
     """Sample SR(λ): yₜ = r + γ·(yₜ₊₁ with probability traceₜ, else Ĝ(sₜ₊₁)), atom by atom.
 
     In expectation over the coin flips the atoms come from the geometric mixture of the n-step
     return distributions, and their mean is the λ-return (sample replacement; Nam et al. 2021).
-
-    Returns:
-        Targets [T, ..., K].
     """
     continues = jax.random.uniform(key, next_quantiles.shape) < trace[..., None]
 

@@ -23,9 +23,7 @@ def check_spectral(weights: ArrayLike) -> np.ndarray:
     w = np.asarray(weights, np.float64)
     if w.ndim != 1 or (w < 0).any() or not abs(w.mean() - 1) < 1e-5:
         found = f"shape {w.shape}, minimum {w.min():g}, mean {w.mean():g}"
-        raise ValueError(
-            f"spectral weights must be a vector, non-negative and of mean 1; got {found}"
-        )
+        raise ValueError(f"spectral weights: must be a vector ≥ 0 and of mean 1, not {found}")
     return w
 
 
@@ -83,45 +81,31 @@ METRICS = {
 """Add your own: `METRICS["mine"] = Metric((), lambda: True, "", lambda k: weights)`."""
 
 
-def forms() -> str:
-    """Return how the known metrics are written."""
-    return ", ".join(":".join((name, *metric.parameters)) for name, metric in METRICS.items())
-
-
 def weights_of(metric: str, k: int) -> Float[np.ndarray, " K"] | None:
-    """Return the weights of a risk measure.
+    """Return the weights [K] of a risk measure; None for `mean`, the paper's metric.
 
     Args:
         metric: `NAME:PARAMETER:…`, such as `cvar:0.25`; the names are those of `METRICS`.
         k: number of quantiles K.
 
-    Returns:
-        The weights [K]; None for `mean`, the paper's metric.
-
     Raises:
         ValueError: the metric does not exist, or its weights are negative or not of mean 1.
     """
-    if metric == "mean":
-        return None
-    family, parameters = _parsed(metric)
-    return check_spectral(family.weights(k, *parameters))
+    family, parameters = parse(metric)
+    return None if metric == "mean" else check_spectral(family.weights(k, *parameters))
 
 
-def check_metric(metric: str) -> None:
-    """Raise ValueError for a metric that does not exist or parameters out of range."""
-    if metric != "mean":
-        _parsed(metric)
-
-
-def _parsed(metric: str) -> tuple[Metric, list[float]]:
+def parse(metric: str) -> tuple[Metric, list[float]]:
+    """Return the family and the parameters of a metric; raise ValueError saying what is allowed."""
+    forms = {name: ":".join((name, *family.parameters)) for name, family in METRICS.items()}
     name, *rest = metric.split(":")
     if name not in METRICS or len(rest) != len(METRICS[name].parameters):
-        raise ValueError(f"one of {forms()}")
+        raise ValueError(f"one of {', '.join(forms.values())}")
     family = METRICS[name]
     try:
         parameters = [float(x) for x in rest]
     except ValueError:
-        raise ValueError(f"{':'.join((name, *family.parameters))} with numbers") from None
+        raise ValueError(f"{forms[name]} with numbers") from None
     if not family.allowed(*parameters):
-        raise ValueError(f"{':'.join((name, *family.parameters))} with {family.limits}")
+        raise ValueError(f"{forms[name]} with {family.limits}")
     return family, parameters

@@ -10,36 +10,23 @@ from jaxtyping import Array, Float
 
 from dgae_jax.maths.transport import quantile_midpoints
 
+Outcomes = Float[Array, "*batch"]
+Quantiles = Float[Array, "*batch K"]
 
-def explained_variance(
-    prediction: Float[Array, "*shape"], outcome: Float[Array, "*shape"]
-) -> Float[Array, ""]:
-    """Compute 1 − Var[outcome − prediction] / Var[outcome].
 
-    Returns:
-        1 for a perfect prediction, 0 for a constant one; NaN where the outcome does not vary.
-    """
+def explained_variance(prediction: Outcomes, outcome: Outcomes) -> Float[Array, ""]:
+    """Compute 1 − Var[outcome − prediction] / Var[outcome]; NaN where the outcome does not vary."""
     variance = outcome.var()
-    return jnp.where(
-        variance > 0,
-        1 - (outcome - prediction).var() / jnp.where(variance > 0, variance, 1),
-        jnp.nan,
-    )
+    residual = (outcome - prediction).var()
+    return jnp.where(variance > 0, 1 - residual / jnp.where(variance > 0, variance, 1), jnp.nan)
 
 
-def pit(
-    quantiles: Float[Array, "*batch K"], outcome: Float[Array, "*batch"]
-) -> Float[Array, "*batch"]:
-    """Compute the probability integral transform: the share of quantiles at or below the outcome.
-
-    It is uniform for a calibrated critic.
-    """
+def pit(quantiles: Quantiles, outcome: Outcomes) -> Outcomes:
+    """Compute the share of quantiles at or below the outcome, uniform for a calibrated critic."""
     return (quantiles <= outcome[..., None]).mean(-1)
 
 
-def coverage(
-    quantiles: Float[Array, "*batch K"], outcome: Float[Array, "*batch"], level: float = 0.9
-) -> Float[Array, ""]:
+def coverage(quantiles: Quantiles, outcome: Outcomes, level: float = 0.9) -> Float[Array, ""]:
     """Compute the share of outcomes inside the central interval that should hold `level` of them.
 
     Args:
@@ -62,9 +49,7 @@ def coverage(
     return ((at(tail, ordered) <= outcome) & (outcome <= at(1 - tail, ordered))).mean()
 
 
-def crps(
-    quantiles: Float[Array, "*batch K"], outcome: Float[Array, "*batch"]
-) -> Float[Array, "*batch"]:
+def crps(quantiles: Quantiles, outcome: Outcomes) -> Outcomes:
     """Compute the continuous ranked probability score, 2 ∫ ρ_τ(y − F⁻¹(τ)) dτ; lower is better.
 
     ρ is the pinball loss at the midpoints. Quantiles are sorted first, because a network's may

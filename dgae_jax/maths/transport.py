@@ -10,19 +10,14 @@ from jaxtyping import Array, ArrayLike, Float
 
 from dgae_jax.maths.risk import check_spectral
 
+Quantiles = Float[Array, "*#batch K"]
+
 UNROLL = 16
 """Targets per loop iteration on a CPU: more take longer to compile and are no faster."""
 
 
 def quantile_midpoints(k: int) -> Float[Array, " K"]:
-    """Return τ̂ᵢ = (2i + 1) / 2K (Dabney et al. 2018, Lemma 2).
-
-    Args:
-        k: number of quantiles K, at least 1.
-
-    Returns:
-        The midpoints [K] at which K quantiles represent a distribution.
-    """
+    """Return the midpoints τ̂ᵢ = (2i + 1) / 2K, K ≥ 1 (Dabney et al. 2018, Lemma 2)."""
     if k < 1:
         raise ValueError(f"the number of quantiles is {k}; it must be at least 1")
     return (2 * jnp.arange(k) + 1) / (2 * k)
@@ -38,7 +33,7 @@ def centered_cumsum(k: int) -> Float[Array, "steps K"]:
     return (at >= step) - (k - step) / k
 
 
-def monotone_quantiles(outputs: Float[Array, "*batch K"]) -> Float[Array, "*batch K"]:
+def monotone_quantiles(outputs: Quantiles) -> Quantiles:
     """Return K quantiles that do not cross, up to rounding.
 
     Args:
@@ -48,20 +43,8 @@ def monotone_quantiles(outputs: Float[Array, "*batch K"]) -> Float[Array, "*batc
     return mean + gaps @ centered_cumsum(outputs.shape[-1])
 
 
-def spectral_weights(weights: ArrayLike) -> Float[Array, " K"]:
-    """Return weights that keep the directional metric translation and scale equivariant.
-
-    The theorem's telescoping rests on that. Traced weights pass unchecked.
-
-    Raises:
-        ValueError: weights are negative or not of mean 1.
-    """
-    traced = isinstance(weights, jax.core.Tracer)
-    return jnp.asarray(weights if traced else check_spectral(weights), float)
-
-
 def directional_metric(
-    u: Float[Array, "*#batch K"], v: Float[Array, "*#batch K"], weights: ArrayLike | None = None
+    u: Quantiles, v: Quantiles, weights: ArrayLike | None = None
 ) -> Float[Array, "*batch"]:
     """Compute d(U, V) = ∫ w(q) (F_U⁻¹(q) − F_V⁻¹(q)) dq (Def. Wasserstein_like_metric).
 
@@ -72,7 +55,8 @@ def directional_metric(
     Args:
         u: quantiles [..., K] of U.
         v: quantiles [..., K] of V.
-        weights: w [K] ≥ 0 of mean 1; None for w ≡ 1.
+        weights: w [K] ≥ 0 of mean 1, on which the theorem's telescoping rests; None for w ≡ 1.
+            Traced ones pass unchecked.
 
     Returns:
         d [...]; positive where U is better.
@@ -82,34 +66,32 @@ def directional_metric(
     """
     if weights is None:
         return (u - v).mean(-1)
-    return (spectral_weights(weights) * (jnp.sort(u) - jnp.sort(v))).mean(-1)
+    if not isinstance(weights, jax.core.Tracer):
+        weights = check_spectral(weights)
+    return (jnp.asarray(weights, float) * (jnp.sort(u) - jnp.sort(v))).mean(-1)
 
 
-def wasserstein(
-    u: Float[Array, "*#batch K"], v: Float[Array, "*#batch K"], p: float = 1
-) -> Float[Array, "*batch"]:
-    """Compute the Wasserstein distance (∫ |F_U⁻¹(q) − F_V⁻¹(q)|ᵖ dq)^(1/p) (Prop. OT_cost).
+def wasserstein(u: Quantiles, v: Quantiles, p: float = 1) -> Float[Array, "*batch"]:
+    """Compute the Wasserstein distance (∫ |F_U⁻¹(q) − F_V⁻¹(q)|ᵖ dq)^(1/p), p ≥ 1 (Prop. OT_cost).
 
     Args:
         u: quantiles [..., K] of U.
         v: quantiles [..., K] of V.
-        p: order, at least 1.
+        p: order.
     """
     if not p >= 1:
         raise ValueError(f"the order p of a Wasserstein distance is {p}; it must be at least 1")
     return (jnp.abs(jnp.sort(u) - jnp.sort(v)) ** p).mean(-1) ** (1 / p)
 
 
-def huber(
-    u: Float[Array, "*shape"], kappa: ArrayLike
-) -> tuple[Float[Array, "*shape"], Float[Array, "*shape"]]:
+def huber(u: Array, kappa: ArrayLike) -> tuple[Array, Array]:
     """Compute L_κ(u) = ½u² for |u| ≤ κ, else κ(|u| − ½κ), and its slope, the clipped u."""
     slope = jnp.clip(u, jnp.negative(kappa), kappa)
     return slope * (u - 0.5 * slope), slope
 
 
 def quantile_huber_loss(
-    quantiles: Float[Array, "*#batch K"],
+    quantiles: Quantiles,
     target: Float[Array, "*#batch J"],
     *,
     kappa: ArrayLike = 1.0,
@@ -123,9 +105,6 @@ def quantile_huber_loss(
         quantiles: predictions [..., K].
         target: samples [..., J] of the return.
         kappa: threshold κ > 0, in units of the return.
-
-    Returns:
-        The loss [...] of each sample.
     """
     batch = jnp.broadcast_shapes(quantiles.shape[:-1], target.shape[:-1])
     quantiles, target = (jnp.broadcast_to(x, (*batch, x.shape[-1])) for x in (quantiles, target))
@@ -137,23 +116,20 @@ def _quantile_huber(quantiles: Array, target: Array, kappa: Array) -> Array:
     return _loss_and_slopes(quantiles, target, kappa)[0]
 
 
-def _loss_and_slopes(
-    quantiles: Array, target: Array, kappa: Array
-) -> tuple[Array, tuple[Array, Array]]:
+def _loss_and_slopes(quantiles: Array, target: Array, kappa: Array):
     """Compute the loss, and its derivatives by quantiles and targets.
 
     A CPU takes one target after the other: storing the K × J errors of a sample costs several times
     more than computing them. An accelerator computes all at once: there each loop iteration costs a
     kernel launch.
     """
-    tau = quantile_midpoints(quantiles.shape[-1])
-    count = target.shape[-1]
+    tau, count = quantile_midpoints(quantiles.shape[-1]), target.shape[-1]
 
     def weighted(error: Array, tau: Array) -> list[Array]:
         weight = jnp.where(error < 0, 1 - tau, tau)
         return [weight * x for x in huber(error, kappa)]
 
-    def on_cpu(quantiles: Array, target: Array) -> tuple[Array, Array, Array]:
+    def on_cpu(quantiles: Array, target: Array):
         def add(sums: tuple[Array, Array], target: Array):
             loss, slope = weighted(target[..., None] - quantiles, tau)
             return (sums[0] + loss, sums[1] - slope), slope.sum(-1)
@@ -162,7 +138,7 @@ def _loss_and_slopes(
         sums, by_target = jax.lax.scan(add, (zeros, zeros), targets, unroll=UNROLL)
         return sums[0].sum(-1), sums[1], jnp.moveaxis(by_target, 0, -1)
 
-    def on_accelerator(quantiles: Array, target: Array) -> tuple[Array, Array, Array]:
+    def on_accelerator(quantiles: Array, target: Array):
         loss, slope = weighted(target[..., None, :] - quantiles[..., None], tau[:, None])
         return loss.sum((-2, -1)), -slope.sum(-1), slope.sum(-2)
 

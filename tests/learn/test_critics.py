@@ -11,11 +11,9 @@ import optax
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
-import dgae_jax as dg
-from dgae_jax.learn.critics import CRITICS, TARGETS, ordered_critic, quantile_critic, sorted_critic
+from dgae_jax.learn.critics import CRITICS, TARGETS
 from dgae_jax.learn.diagnostics import critic_diagnostics
 from dgae_jax.maths.returns import decay
-from dgae_jax.maths.transport import quantile_midpoints
 from tests.learn.batches import make_batch
 
 FIRST, SECOND, END = jnp.eye(3)
@@ -50,14 +48,9 @@ def fixed_point(kind, target, lam, end="terminal", steps=1500):
     def iteration(carry, key):
         params, opt_state = carry
         quantiles, next_quantiles = (critic.predict(params, x) for x in (obs, next_obs))
-        batch = make_batch(
-            obs,
-            value=quantiles.mean(-1),
-            target=critic.target(key, reward, discount, trace, quantiles, next_quantiles),
-            reward=reward,
-            discount=discount,
-            next_obs=next_obs,
-        )
+        given = {"reward": reward, "discount": discount, "next_obs": next_obs}
+        target = critic.target(key, reward, discount, trace, quantiles, next_quantiles)
+        batch = make_batch(obs, value=quantiles.mean(-1), target=target, **given)
         batch = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), batch)
         gradient = jax.grad(lambda p: critic.loss(p, batch)[0])(params)
         updates, opt_state = optimizer.update(gradient, opt_state)
@@ -79,14 +72,11 @@ def fixed_point(kind, target, lam, end="terminal", steps=1500):
         ("quantile", "bellman", 0.5, "terminal"),
         ("quantile", "bellman-frozen", 0.5, "terminal"),
         ("quantile", "sr-lambda", 0.5, "terminal"),
-        ("quantile", "sr-lambda", 1.0, "terminal"),
         ("quantile", "lambda-shift", 0.0, "terminal"),
         ("quantile", "lambda-return", 1.0, "terminal"),
         ("quantile", "monte-carlo", 0.0, "terminal"),
         ("ordered", "bellman", 0.5, "terminal"),
         ("ordered", "sr-lambda", 0.5, "terminal"),
-        ("ordered", "lambda-return", 1.0, "terminal"),
-        ("quantile", "bellman", 0.5, "absorbing"),
         ("quantile", "sr-lambda", 0.5, "absorbing"),
     ],
 )
@@ -96,20 +86,18 @@ def test_the_critic_learns_the_true_quantiles(kind, target, lam, end):
     assert_allclose(got["second"], TRUE["second"], atol=0.1)
 
 
-def test_lambda_return_loses_the_spread_of_its_bootstrap():
-    # λ = 0: all quantiles see r + γ E[G(second)] = ±1
-    got = fixed_point("quantile", "lambda-return", 0.0)["first"]
-    assert_allclose(got, [-1, -1, 1, 1], atol=0.1)
+def test_other_targets_have_spreads_of_their_own():
+    # λ = 0: all quantiles see r + γ E[G(second)] = ±1; λ = 1: the mean moves with the second coin
+    # and the shape holds it again, ±1 ± ½ ± ½
+    assert_allclose(
+        fixed_point("quantile", "lambda-return", 0.0)["first"], [-1, -1, 1, 1], atol=0.1
+    )
+    twice = fixed_point("quantile", "lambda-shift", 1.0)["first"]
+    assert twice.std() > 1.05 * jnp.array(TRUE["first"]).std()
 
 
-def test_lambda_shift_counts_the_spread_of_the_bootstrap_twice():
-    # λ = 1: the mean moves with the second coin and the shape holds it again: ±1 ± ½ ± ½
-    got = fixed_point("quantile", "lambda-shift", 1.0)["first"]
-    assert got.std() > 1.05 * jnp.array(TRUE["first"]).std()
-
-
-@pytest.mark.parametrize("target", TARGETS)
-def test_a_scalar_critic_learns_the_mean_from_every_target(target):
+@pytest.mark.parametrize("target", ["bellman", "sr-lambda", "lambda-return"])
+def test_a_scalar_critic_learns_the_mean_from_its_targets(target):
     got = fixed_point("scalar", target, 0.5, steps=500)
     assert_allclose([got["first"], got["second"]], 0, atol=0.05)
 
@@ -121,12 +109,9 @@ def test_a_scalar_critic_learns_the_mean_from_every_target(target):
 def batch():
     obs, next_obs = jax.random.normal(jax.random.key(0), (2, 24, 3))
     reward = jax.random.normal(jax.random.key(1), (24,))
+    discount = jnp.full(24, 0.9)
     return make_batch(
-        obs,
-        target=reward[:, None],
-        reward=reward,
-        discount=jnp.full(24, 0.9),
-        next_obs=next_obs,
+        obs, target=reward[:, None], reward=reward, discount=discount, next_obs=next_obs
     )
 
 
@@ -139,36 +124,8 @@ def test_only_the_bellman_target_follows_the_critic(target, follows, batch, key)
     assert changed == follows
 
 
-def test_ordered_critic_fits_the_mean_and_the_crps_of_the_shape(key):
-    target = TARGETS["bellman-frozen"]
-    critic = ordered_critic(3, hidden=(), target=target, quantiles=8, kappa=1e-5)
-    params, targets, value = critic.init(key), jax.random.normal(key, (24, 5)), jnp.arange(24) / 12
-    batch = make_batch(jnp.zeros((24, 3)), target=targets, value=value)
-
-    @jax.jit
-    def by_output(params):
-        """Gradients of three losses by the network's outputs, its biases where obs is 0."""
-
-        def mean(p):
-            error = critic.predict(p, batch.obs).mean(-1) - targets.mean(-1)
-            return 8 / 2 * (0.5 * error**2).mean()
-
-        def shape(p):
-            quantiles = critic.predict(p, batch.obs)
-            about = quantiles - quantiles.mean(-1, keepdims=True) + value[:, None]
-            return 8 / 2 * jax.vmap(dg.crps, (None, -1))(about, targets).mean() / 64
-
-        losses = (lambda p: critic.loss(p, batch)[0]), mean, shape
-        return [jax.grad(loss)(params)["params"]["Dense_0"]["bias"] for loss in losses]
-
-    got, mean, shape = by_output(params)
-    assert_allclose(got[0], mean[0], rtol=1e-5)
-    assert_allclose(got[1:], shape[1:], rtol=1e-3, atol=1e-6)
-
-
 def test_a_sorted_critic_is_a_quantile_critic_with_sorted_predictions(batch, key):
-    options = {"hidden": (4,), "target": TARGETS["bellman"], "quantiles": 8, "kappa": 1.0}
-    plain, ordered = quantile_critic(3, **options), sorted_critic(3, **options)
+    plain, ordered = (make_critic(kind, "bellman", quantiles=8) for kind in ("quantile", "sorted"))
     params = plain.init(key)
     predicted = plain.predict(params, batch.obs)
     assert (jnp.diff(predicted) < 0).any()
@@ -177,18 +134,6 @@ def test_a_sorted_critic_is_a_quantile_critic_with_sorted_predictions(batch, key
 
 
 # ---- calibration ----
-
-
-def test_the_bootstrap_at_the_end_of_a_rollout_inflates_coverage(key):
-    # a perfect critic of N(0, 1) rewards, γ = 0.99: G ~ N(0, 1/(1 − γ²)); m steps before the end
-    # the outcome has the share 1 − γ²ᵐ of that variance, so that the interval of 90 % holds
-    # 2Φ(1.645/√(1 − γ²ᵐ)) − 1, on average 0.953 over m = 1 … 128
-    gamma, k, shape = 0.99, 64, (128, 400)
-    quantiles = jax.scipy.stats.norm.ppf(quantile_midpoints(k)) / (1 - gamma**2) ** 0.5
-    quantiles = jnp.broadcast_to(quantiles, (*shape, k))
-    reward, discount = jax.random.normal(key, shape), jnp.full(shape, gamma)
-    got = critic_diagnostics(reward, discount, jnp.ones(shape), quantiles, quantiles)
-    assert_allclose(got["critic/coverage_90"], 0.953, atol=0.015)
 
 
 def test_similar_means_and_crossing_quantiles_are_counted():

@@ -1,7 +1,5 @@
 """Whole iterations: determinism, learning of known values, what updates are handed, failures."""
 
-from functools import cache
-
 import chex
 import jax
 import jax.numpy as jnp
@@ -11,16 +9,10 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 import dgae_jax as dg
 from dgae_jax.configs.algorithms import ALGORITHMS
-from dgae_jax.learn.build import make_greedy, make_task, make_trainer, policies_of, seed_keys
-from dgae_jax.learn.types import TrainableState, Update
+from dgae_jax.learn.build import make_greedy, make_trainer, policies_of, seed_keys
+from dgae_jax.learn.types import Update
 from tests.helpers import distance, small
-from tests.parity import WARP
-from tests.probes import Coin, Constant, Counter, Fragile, Target
-
-
-@cache
-def hopper():
-    return make_trainer(dg.make_env("hopper", physics="native"), 4)
+from tests.probes import Constant, Counter, Fragile, Target
 
 
 def init(trainer, config):
@@ -35,7 +27,7 @@ def assert_same_bits(a, b):
 
 
 def test_results_do_not_depend_on_iterations_per_dispatch():
-    config, trainer = dg.resolve(small("dppo")), hopper()
+    trainer, config = make_trainer(Counter(), 4), dg.resolve(small("ppo"))
     together, rows = trainer.dispatch(config, init(trainer, config), 3)
     one_by_one = init(trainer, config)
     for i in range(3):
@@ -44,21 +36,14 @@ def test_results_do_not_depend_on_iterations_per_dispatch():
             assert_array_equal(rows[name][i], row[name][0])
     assert_same_bits(together, one_by_one)
     assert int(together.iteration[0]) == 3
-
-
-def test_a_run_is_two_programs_whatever_the_count_and_the_floats():
-    trainer = make_trainer(Counter(), 4)
-    state = init(trainer, dg.resolve(small("ppo")))
-    for count, gamma, rate in ((1, 0.99, 3e-4), (4, 0.9, 1e-3), (2, 0.5, 1e-2)):
-        config = small("ppo").replace(**{"gamma": gamma, "policy.learning_rate": rate})
-        state, _ = trainer.dispatch(dg.resolve(config), state, count)
-    assert int(state.iteration[0]) == 7
+    other = small("ppo").replace(**{"gamma": 0.5, "policy.learning_rate": 1e-2})
+    trainer.dispatch(dg.resolve(other), together, 2)  # other floats need no other program
     assert (trainer.init._cache_size(), trainer.dispatch._cache_size()) == (1, 1)
 
 
 def test_a_seed_among_others_is_the_single_run_up_to_rounding():
     # bit for bit at the start; then a batched matrix product may round differently
-    trainer = hopper()
+    trainer = make_trainer(Counter(), 2)
     three, single = (dg.resolve(small("dppo", num_seeds=n, seed=s)) for n, s in ((3, 5), (1, 6)))
     ours, theirs = init(trainer, three), init(trainer, single)
     assert_same_bits(jax.tree.map(lambda x: x[1:2], ours), theirs)
@@ -74,11 +59,9 @@ def test_a_seed_among_others_is_the_single_run_up_to_rounding():
 def learn(env, algo, iterations, **changes):
     """The configuration, the state after so many iterations, and the metrics."""
     fit = {"epochs": 4, "minibatches": 4, "learning_rate": 3e-3, "learning_rate_end": 1.0}
-    policy = {
-        "clip": fit,
-        "gradient": {**fit, "epochs": 1, "minibatches": 1, "learning_rate": 3e-2},
-        "trust-region": {},
-    }[ALGORITHMS[algo].policy_update]
+    once = {**fit, "epochs": 1, "minibatches": 1, "learning_rate": 3e-2}
+    by_update = {"clip": fit, "gradient": once, "trust-region": {}}
+    policy = by_update[ALGORITHMS[algo].policy_update]
     quantiles = {"quantiles": 8} if algo.startswith("d") else {}
     config = dg.Config(
         algo=algo,
@@ -115,17 +98,6 @@ def test_the_critic_finds_the_value_of_a_constant_reward(algo, target):
     changes = {"gamma": 0.5, "episode_length": 5, "critic.target": target, **UNSCALED}
     _, _, rows = learn(Constant(), algo, 60, **changes)
     assert_allclose(rows["critic/value"][-1, 0], 2.0, atol=0.05)
-
-
-def test_a_quantile_critic_finds_the_distribution_of_a_noisy_reward():
-    changes = {"critic.kappa": 0.05, "diagnostics": True, **UNSCALED}
-    config, state, rows = learn(Coin(), "dtrpo", 80, **changes)
-    critic = dg.make_algorithm("dtrpo", Coin(), config).critic
-    quantiles = critic.predict(state.critic.params, jnp.ones(1))
-    assert_allclose(jnp.sort(quantiles), [-1] * 4 + [1] * 4, atol=0.35)
-    # half of its mass is 2 away from either outcome
-    assert_allclose(rows["critic/wasserstein"][-1, 0], 1.0, atol=0.25)
-    assert rows["critic/similar_means"].shape == (80, 1)
 
 
 def test_a_non_finite_env_reaches_no_statistic_and_no_network():
@@ -194,7 +166,7 @@ def test_statistics_are_frozen_across_rollout_and_update():
     # one epoch of one minibatch looks at the batch once, with the policy that acted: ρ = 1
     once = small("ppo").replace(**{"policy.epochs": 1, "policy.minibatches": 1})
     update = dg.make_algorithm("ppo", Counter(), once).policy_update
-    states, rows = iterate(Counter(), 3, policy_update=update)
+    states, rows = iterate(Counter(), 2, policy_update=update)
     assert_allclose([row["policy/kl"] for row in rows], 0, atol=1e-6)
     assert_array_equal([row["policy/clip_fraction"] for row in rows], 0)
     assert distance(states[-1].policy.params, states[0].policy.params) > 1e-4
@@ -203,27 +175,20 @@ def test_statistics_are_frozen_across_rollout_and_update():
 
 @pytest.mark.parametrize(
     ("broken", "healthy", "what"),
-    [
-        ("policy", "critic", "parameters"),
-        ("critic", "policy", "optimizer"),
-        ("critic", "policy", "loss"),
-    ],
+    [("policy", "critic", "parameters"), ("critic", "policy", "loss")],
 )
 def test_a_non_finite_update_is_skipped_and_the_other_is_not(broken, healthy, what):
     def spoil(key, state, batch):
-        step = jnp.where(what == "parameters", jnp.nan, 1)
-        params = jax.tree.map(lambda x: x + step, state.params)
-        moments = jnp.where(what == "optimizer", jnp.inf, 1.0)
-        return TrainableState(params, moments), {"loss": jnp.where(what == "loss", jnp.nan, 0.0)}
+        params = jax.tree.map(lambda x: x + (jnp.nan if what == "parameters" else 1), state.params)
+        return state._replace(params=params), {
+            "loss": jnp.array(0.0 if what != "loss" else jnp.nan)
+        }
 
     def move(key, state, batch):
         params = jax.tree.map(lambda x: x + 1, state.params)
-        return TrainableState(params, state.opt_state), {"loss": jnp.zeros(())}
+        return state._replace(params=params), {"loss": jnp.zeros(())}
 
-    updates = {
-        f"{broken}_update": Update(lambda params: jnp.zeros(()), spoil),
-        f"{healthy}_update": Update(stay, move),
-    }
+    updates = {f"{broken}_update": Update(stay, spoil), f"{healthy}_update": Update(stay, move)}
     (before, *_, after), rows = iterate(Counter(), 2, **updates)
     chex.assert_trees_all_equal(getattr(after, broken), getattr(before, broken))
     want = jax.tree.map(lambda x: x + 2, getattr(before, healthy).params)
@@ -244,39 +209,8 @@ class Breaking(Counter):
         return after.replace(reward=jnp.where(after.obs[0] == self.at, jnp.nan, after.reward))
 
 
-@pytest.mark.parametrize(
-    ("at", "failures"),
-    [
-        (1, [1, 2, 3, 4]),  # every step is masked
-        (2, [0, 1, 0, 1]),  # of three steps one, then two, then one, …
-    ],
-)
-def test_an_iteration_with_most_steps_masked_counts_as_a_failure(at, failures):
-    states, rows = iterate(Breaking(at), 4)
-    assert [int(state.failures) for state in states[1:]] == failures
-    assert all(row["skipped"] == 0 for row in rows)
-
-
-# ---- engines ----
-
-
-@cache
-def returns(physics):
-    """Mean return of each of ten iterations of DPPO on Hopper."""
-    config = dg.Config(physics=physics, num_envs=16, num_steps=128, total_steps=10 * 16 * 128)
-    config = dg.resolve(config)
-    trainer = make_trainer(make_task(config), 10)
-    _, rows = trainer.dispatch(config, init(trainer, config), 10)
-    return np.asarray(rows["episode_return"])[:, 0]
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("physics", ["native", "mjx", pytest.param("mjx-warp", marks=WARP)])
-def test_ten_iterations_on_hopper_have_similar_returns_on_every_engine(physics):
-    # The first iteration differs by the engines' rounding, which updates and contacts multiply.
-    # How fast the policy learns stays alike: jax and native differ by 12 % over the last five.
-    ours, theirs = returns("jax"), returns(physics)
-    assert_allclose(theirs[0], ours[0], rtol=1e-3)
-    assert_allclose(theirs[1], ours[1], rtol=0.05)
-    assert_allclose(theirs[5:].mean(), ours[5:].mean(), rtol=0.35)
-    assert theirs[-1] > 4 * theirs[0]
+def test_an_iteration_with_most_steps_masked_counts_as_a_failure():
+    for at, failures in ((1, [1, 2, 3]), (2, [0, 1, 0])):  # all masked; of three one, two, one, …
+        states, rows = iterate(Breaking(at), 3)
+        assert [int(state.failures) for state in states[1:]] == failures
+        assert all(row["skipped"] == 0 for row in rows)

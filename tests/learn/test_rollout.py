@@ -34,16 +34,13 @@ def all_finite(tree):
     return all(np.isfinite(x).all() for x in tree)
 
 
-def test_a_time_limit_truncates():
-    _, step = counter()
-    assert not step.terminated.any()
-    assert_array_equal(np.flatnonzero(step.truncated[:, 0]), [4, 9])
-
-
-def test_the_end_of_the_task_terminates_even_at_the_time_limit(key):
-    _, step = run(Counter(length=5), key, episode_length=5)
-    assert not step.truncated.any()
-    assert_array_equal(np.flatnonzero(step.terminated[:, 0]), [4, 9])
+def test_a_time_limit_truncates_and_the_end_of_the_task_terminates(key):
+    _, limited = counter()
+    assert not limited.terminated.any()
+    assert_array_equal(np.flatnonzero(limited.truncated[:, 0]), [4, 9])
+    _, ended = run(Counter(length=5), key, episode_length=5)  # at the limit too
+    assert not ended.truncated.any()
+    assert_array_equal(np.flatnonzero(ended.terminated[:, 0]), [4, 9])
 
 
 def test_next_obs_is_the_true_successor():
@@ -65,7 +62,7 @@ def test_every_episode_starts_from_a_random_state_of_its_own():
 def test_episode_returns_are_undiscounted_and_nan_before_the_first_end(key):
     episodes, _ = run(Counter(), key, num_steps=4)
     assert jnp.isnan(episodes.last_total).all()
-    episodes, _ = run(Counter(), key, num_steps=7)
+    episodes, _ = counter()  # the third episode is at its second step
     assert_allclose(episodes.last_total, 1 + 2 + 3 + 4 + 5)
     assert_allclose(episodes.last_steps, 5)
     assert_allclose(episodes.total, 1 + 2)
@@ -78,8 +75,9 @@ def test_actions_are_clipped_before_they_act_and_recorded_as_sampled():
     assert_array_equal(episodes.env.metrics["action"][0], 1.0)
 
 
-@pytest.mark.parametrize("value", [jnp.nan, jnp.inf])
-@pytest.mark.parametrize("part", ["pipeline_state", "reward", "obs"])
+@pytest.mark.parametrize(
+    ("part", "value"), [("pipeline_state", jnp.nan), ("reward", jnp.inf), ("obs", jnp.nan)]
+)
 def test_a_non_finite_env_is_masked_and_starts_afresh(part, value, key):
     env = Fragile(value, part)
     episodes, step = run(env, key, num_envs=16, num_steps=4, episode_length=100)
@@ -128,22 +126,13 @@ def test_an_env_depends_on_its_own_keys_alone(key):
 # ---- episodes that are only watched ----
 
 
-def watched(env, key, limits):
+@pytest.mark.parametrize("limits", [[4], [1, 2, 3, 4]])
+@pytest.mark.parametrize("length", [3, 9])
+def test_play_sums_each_episode_until_its_end_in_chunks_of_any_size(length, limits, key):
+    env = Counter(length=length)  # pays 1, 2, 3, …
     episodes = begin(jax.vmap(env.reset)(jax.random.split(key, 6)))
     for until in limits:
         episodes = play(env, lambda obs: jnp.zeros((*obs.shape[:-1], 1)), episodes, until)
-    return episodes
-
-
-def test_play_sums_each_episode_until_its_own_end(key):
-    after = watched(Counter(length=3), key, [100])  # pays 1, 2, 3
-    assert_allclose(after.total, [6.0] * 6)
-    assert not after.alive.any()
-    assert int(after.step) == 3
-
-
-@pytest.mark.parametrize("limits", [[4], [1, 2, 3, 4], [3, 4]])
-def test_play_in_chunks_of_any_size_is_the_same(limits, key):
-    after = watched(Counter(), key, limits)
-    assert_allclose(after.total, [1.0 + 2 + 3 + 4] * 6)
-    assert after.alive.all()
+    assert_allclose(episodes.total, [sum(range(1, min(length, 4) + 1))] * 6)
+    assert episodes.alive.all() == (length > 4)
+    assert int(episodes.step) == min(length, 4)

@@ -1,6 +1,5 @@
 import jax
 import jax.numpy as jnp
-import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
@@ -9,7 +8,7 @@ from dgae_jax.maths.returns import decay
 
 GAMMA, LAM = 0.9, 0.8
 CVAR_HALF = jnp.array([2.0, 2.0, 0.0, 0.0])
-WEIGHTS = [None, CVAR_HALF, jnp.array([0.4, 0.8, 1.2, 1.6])]
+WEIGHTS = [None, CVAR_HALF]
 
 
 def trajectory(key, steps=12, envs=3, k=4, ends=True):
@@ -49,24 +48,12 @@ def test_dgae_with_the_identity_metric_is_gae_on_the_means(key):
     assert_allclose(got, want, atol=1e-5)
 
 
-def test_scan_agrees_with_a_plain_loop(key):
-    reward, z, z_next, terminated, truncated = map(np.asarray, trajectory(key))
-    value, next_value = z.mean(-1), z_next.mean(-1)
-    want, later = np.zeros_like(reward), np.zeros(3)
-    for t in reversed(range(12)):
-        delta = reward[t] + GAMMA * (1 - terminated[t]) * next_value[t] - value[t]
-        want[t] = later = delta + GAMMA * LAM * (1 - (terminated[t] | truncated[t])) * later
-    args = map(jnp.asarray, (reward, z, z_next, terminated, truncated))
-    assert_allclose(dg.dgae(*args, gamma=GAMMA, lam=LAM), want, atol=1e-5)
-
-
 @pytest.mark.parametrize("weights", WEIGHTS)
-@pytest.mark.parametrize("n", [1, 2, 5])
+@pytest.mark.parametrize("n", [1, 5])
 def test_n_step_advantages_telescope_into_td_errors(n, weights, key):
     reward, z, z_next, terminated, truncated = trajectory(key, ends=False)
-    got = dg.n_step_advantage(
-        reward, z, z_next, terminated, truncated, gamma=GAMMA, n=n, weights=weights
-    )
+    args = reward, z, z_next, terminated, truncated
+    got = dg.n_step_advantage(*args, gamma=GAMMA, n=n, weights=weights)
     delta = dg.distributional_td_residual(reward, jnp.full_like(reward, GAMMA), z, z_next, weights)
     for t in range(12):
         want = sum(GAMMA**k * delta[t + k] for k in range(min(n, 12 - t)))
@@ -106,57 +93,33 @@ def test_bellman_target_by_hand():
     assert_allclose(dg.bellman_target(reward, discount, z_next), [[2.0, 3.0], [2.0, 2.0]])
 
 
-def test_lambda_return_is_value_plus_gae(key):
-    reward, z, z_next, terminated, truncated = trajectory(key)
-    d = decay(terminated, truncated, gamma=GAMMA, lam=LAM)
-    advantage = dg.gae(
-        reward, z.mean(-1), z_next.mean(-1), terminated, truncated, gamma=GAMMA, lam=LAM
-    )
-    got = dg.lambda_return(reward, *d, z, z_next)
-    assert got.shape == (12, 3)
-    assert_allclose(got, z.mean(-1) + advantage, atol=1e-6)
-
-
 def test_lambda_shift_has_the_lambda_mean_and_one_step_shape(key):
-    reward, z, z_next, terminated, truncated = trajectory(key)
-    d = decay(terminated, truncated, gamma=GAMMA, lam=LAM)
-    got, one_step = (
-        dg.lambda_shift_target(reward, *d, z, z_next),
-        dg.bellman_target(reward, d.discount, z_next),
-    )
-    assert_allclose(got.mean(-1), dg.lambda_return(reward, *d, z, z_next), atol=1e-5)
-    assert_allclose(
-        got - got.mean(-1, keepdims=True), one_step - one_step.mean(-1, keepdims=True), atol=1e-5
-    )
+    reward, z, z_next, *ends = trajectory(key)
+    d = decay(*ends, gamma=GAMMA, lam=LAM)
+    mean = z.mean(-1) + dg.gae(reward, z.mean(-1), z_next.mean(-1), *ends, gamma=GAMMA, lam=LAM)
+    assert_allclose(dg.lambda_return(reward, *d, z, z_next), mean, atol=1e-6)
+    got = dg.lambda_shift_target(reward, *d, z, z_next)
+    one_step = dg.bellman_target(reward, d.discount, z_next)
+    assert_allclose(got.mean(-1), mean, atol=1e-5)
+    shapes = (x - x.mean(-1, keepdims=True) for x in (got, one_step))
+    assert_allclose(*shapes, atol=1e-5)
 
 
-def test_sr_lambda_zero_is_the_bellman_target(key):
-    reward, _, z_next, terminated, truncated = trajectory(key)
-    d = decay(terminated, truncated, gamma=GAMMA, lam=0.0)
-    assert_allclose(
-        dg.sr_lambda_target(key, reward, *d, z_next),
-        dg.bellman_target(reward, d.discount, z_next),
-        atol=1e-6,
-    )
-
-
-def test_sr_lambda_one_is_the_return_to_the_end_of_the_trace(key):
-    reward, _, z_next, terminated, truncated = trajectory(key)
-    d = decay(terminated, truncated, gamma=GAMMA, lam=1.0)
-    got, later = dg.sr_lambda_target(key, reward, *d, z_next), np.asarray(z_next[-1])
+@pytest.mark.parametrize("lam", [0.0, 1.0])
+def test_sr_lambda_zero_is_one_step_and_one_the_end_of_the_trace(lam, key):
+    reward, _, z_next, *ends = trajectory(key)
+    d = decay(*ends, gamma=GAMMA, lam=lam)
+    got, later = dg.sr_lambda_target(key, reward, *d, z_next), z_next[-1]
     for t in reversed(range(12)):
-        done = np.asarray(terminated | truncated)[t][:, None]
-        later = np.asarray(reward[t])[:, None] + np.asarray(d.discount[t])[:, None] * np.where(
-            done, z_next[t], later
-        )
+        later = jnp.where(d.trace[t][:, None] > 0, later, z_next[t])
+        later = dg.bellman_target(reward[t], d.discount[t], later)
         assert_allclose(got[t], later, atol=1e-5)
 
 
 def test_sr_lambda_has_the_mean_of_the_lambda_return(key):
-    reward, z, z_next, terminated, truncated = trajectory(key)
-    d = decay(terminated, truncated, gamma=GAMMA, lam=LAM)
-    draws = jax.vmap(lambda k: dg.sr_lambda_target(k, reward, *d, z_next).mean(-1))(
-        jax.random.split(key, 4_000)
-    )
+    reward, z, z_next, *ends = trajectory(key)
+    d = decay(*ends, gamma=GAMMA, lam=LAM)
+    keys = jax.random.split(key, 4_000)
+    draws = jax.vmap(lambda k: dg.sr_lambda_target(k, reward, *d, z_next).mean(-1))(keys)
     error = draws.mean(0) - dg.lambda_return(reward, *d, z, z_next)
     assert jnp.all(jnp.abs(error) < 5 * draws.std(0) / 4_000**0.5 + 1e-5)

@@ -6,21 +6,10 @@ from scipy.stats import norm
 
 from dgae_jax.maths.returns import distributional_td_residual
 from dgae_jax.maths.risk import METRICS, weights_of
-from dgae_jax.maths.transport import directional_metric
-
-SPECS = [
-    "mean-cvar:0.25:0.5",
-    "cvar:0.25",
-    "cvar:1",
-    "wang:0.75",
-    "wang:-0.5",
-    "power:2",
-    "power:0.5",
-]
 
 
-@pytest.mark.parametrize("spec", SPECS)
-@pytest.mark.parametrize("k", [1, 4, 7, 64])
+@pytest.mark.parametrize("spec", ["mean-cvar:0.25:0.5", "cvar:0.25", "wang:-0.5", "power:0.5"])
+@pytest.mark.parametrize("k", [1, 7])
 def test_weights_are_non_negative_and_of_mean_one(spec, k):
     weights = weights_of(spec, k)
     assert (weights >= 0).all()
@@ -51,36 +40,28 @@ def test_neutral_parameters_are_the_mean_and_the_mean_needs_no_weights():
 
 
 @pytest.mark.parametrize(
-    "spec",
+    ("spec", "allowed"),
     [
-        "cvar",
-        "cvar:0",
-        "cvar:1.5",
-        "cvar:x",
-        "wang:inf",
-        "power:0",
-        "power:-1",
-        "mean:1",
-        "mean-cvar:0.1:2",
-        "median",
+        ("cvar", "one of mean, cvar:α"),
+        ("median", "one of mean, cvar:α"),
+        ("mean:1", "one of mean, cvar:α"),
+        ("cvar:x", "cvar:α with numbers"),
+        ("cvar:0", "cvar:α with 1e-6 ≤ α ≤ 1"),
+        ("wang:inf", "wang:β with −5 ≤ β ≤ 5"),
+        ("mean-cvar:0.1:2", "mean-cvar:α:weight with"),
     ],
 )
-def test_other_metrics_are_refused_with_what_is_allowed(spec):
-    with pytest.raises(
-        ValueError, match="cvar" if spec in ("cvar", "mean:1", "median") else spec.split(":")[0]
-    ):
+def test_other_metrics_are_refused_with_what_is_allowed(spec, allowed):
+    with pytest.raises(ValueError, match=f"^{allowed}"):
         weights_of(spec, 8)
 
 
 def test_custom_metrics_join_the_table_and_must_have_mean_one(monkeypatch):
     neutral = METRICS["mean"]
-    monkeypatch.setitem(
-        METRICS, "median", neutral._replace(weights=lambda k: jnp.zeros(k).at[k // 2].set(k))
-    )
+    median = neutral._replace(weights=lambda k: jnp.zeros(k).at[k // 2].set(k))
+    monkeypatch.setitem(METRICS, "median", median)
     monkeypatch.setitem(METRICS, "double", neutral._replace(weights=lambda k: 2 * jnp.ones(k)))
-    assert_allclose(
-        directional_metric(jnp.array([1.0, 5.0, 9.0]), jnp.zeros(3), weights_of("median", 3)), 5
-    )
+    assert_allclose(weights_of("median", 3), [0, 3, 0])
     with pytest.raises(ValueError, match="mean 1"):
         weights_of("double", 3)
 
@@ -94,9 +75,8 @@ def test_risk_cancels_at_lambda_one_and_counts_once_at_lambda_zero():
         return distributional_td_residual(reward, one, quantiles, next_quantiles, weights)
 
     coin = jnp.stack([delta(jnp.float32(r), before, jnp.zeros(2)) for r in (0, 10)])
-    assert_allclose(
-        coin, [0, 10]
-    )  # the value by CVaR is 0: E[δ] ≠ 0 although the critic is perfect
+    # the value by CVaR is 0: E[δ] ≠ 0 although the critic is perfect
+    assert_allclose(coin, [0, 10])
     # λ = 1: the gamble and a sure 5 from the same state differ by their means alone
     assert_allclose(coin.mean() - delta(jnp.float32(5), before, jnp.zeros(2)), 0, atol=1e-6)
     # λ = 0: the step into the gamble is 5 worse than the step to the sure payment

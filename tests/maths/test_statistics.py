@@ -32,29 +32,20 @@ def test_true_distribution_has_uniform_pit_and_nominal_coverage(key):
     assert_allclose(dg.coverage(0.5 * z, y, 0.9), half, atol=0.015)
 
 
-@pytest.mark.parametrize("k", [1, 4, 9])
-def test_fewer_than_ten_quantiles_have_no_central_ninety_percent(k):
-    # the outermost midpoints enclose 1 − 1/K of the outcomes: less than 0.9 for K < 10
-    y = jnp.linspace(0, 1, 1001)
-    assert jnp.isnan(dg.coverage(jnp.broadcast_to(dg.quantile_midpoints(k), (1001, k)), y, 0.9))
-
-
 @pytest.mark.parametrize("of", [scipy.stats.uniform, scipy.stats.norm])
-@pytest.mark.parametrize(("k", "level"), [(10, 0.9), (2, 0.5), (4, 0.75)])
+@pytest.mark.parametrize(("k", "level"), [(10, 0.9), (4, 0.75), (9, 0.9)])
 def test_exact_quantiles_have_nominal_coverage_up_to_the_outermost(of, k, level):
+    # the outermost midpoints enclose 1 − 1/K of the outcomes: less than 0.9 for K < 10
     y = jnp.asarray(of.ppf((np.arange(10_000) + 0.5) / 10_000), jnp.float32)
     z = jnp.asarray(of.ppf(np.asarray(dg.quantile_midpoints(k))), jnp.float32)
-    assert_allclose(dg.coverage(jnp.broadcast_to(z, (10_000, k)), y, level), level, atol=0.015)
+    want = level if level <= 1 - 1 / k else np.nan
+    assert_allclose(dg.coverage(jnp.broadcast_to(z, (10_000, k)), y, level), want, atol=0.015)
 
 
 def test_crps_does_not_depend_on_the_order_of_the_quantiles():
     # sorted 0, 1, 2 with τ = 1/6, 1/2, 5/6 and outcome 1: 2/3 · (1·1/6 + 0 + 1·1/6) = 2/9
     for z in ([0.0, 1.0, 2.0], [2.0, 1.0, 0.0], [1.0, 2.0, 0.0]):
         assert_allclose(dg.crps(jnp.array(z), jnp.float32(1.0)), 2 / 9, rtol=1e-6)
-
-
-def test_crps_of_a_point_is_the_distance_to_it():
-    assert_allclose(dg.crps(jnp.full((2, 8), 3.0), jnp.array([5.0, 3.0])), [2.0, 0.0], atol=1e-6)
 
 
 def test_crps_of_the_standard_normal_at_zero_has_its_known_value():
@@ -68,18 +59,12 @@ def test_crps_of_the_standard_normal_at_zero_has_its_known_value():
     [
         ([8, 1, 7, 2, 6, 3, 5, 4], 4.5),  # two of eight off at each end: (3 + 4 + 5 + 6) / 4
         ([1, 2, 6], 3.0),  # ⌊3/4⌋ = 0
-        ([7], 7.0),
     ],
 )
 def test_interquartile_mean_leaves_out_a_quarter_at_each_end(scores, mean):
     assert dg.iqm(np.array(scores, float)) == mean
     assert dg.iqm(jnp.array(scores, float)) == mean
     assert dg.iqm([np.array(scores[:1], float), np.array(scores[1:], float)]) == mean  # pooled
-
-
-def test_interquartile_mean_agrees_with_scipy():
-    x = np.random.default_rng(0).normal(size=(5, 11))
-    assert_allclose(dg.iqm(x), scipy.stats.trim_mean(x, 0.25, axis=-1), rtol=1e-14)
 
 
 def test_interval_of_two_samples_lies_between_them():
@@ -92,12 +77,6 @@ def test_strata_keep_their_sizes_in_each_draw():
     assert_array_equal(dg.bootstrap_interval(strata), [0.5, 0.5])
     low, high = dg.bootstrap_interval(np.concatenate(strata))
     assert low < 0.25 < 0.75 < high
-
-
-def test_same_samples_give_the_same_interval():
-    x = np.random.default_rng(1).normal(size=9)
-    assert_array_equal(dg.bootstrap_interval(x), dg.bootstrap_interval(x))
-    assert (dg.bootstrap_interval(x) != dg.bootstrap_interval(x, seed=1)).any()
 
 
 def _pooled(*tasks, axis):

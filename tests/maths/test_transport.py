@@ -6,7 +6,7 @@ import scipy.stats
 from numpy.testing import assert_allclose
 
 import dgae_jax as dg
-from dgae_jax.maths.transport import huber, monotone_quantiles
+from dgae_jax.maths.transport import monotone_quantiles
 
 CVAR_HALF = jnp.array([2.0, 2.0, 0.0, 0.0])  # mean of the worse half
 
@@ -17,20 +17,17 @@ def test_midpoints_of_four_quantiles_are_the_odd_eighths():
         dg.quantile_midpoints(0)
 
 
-def test_directional_metric_is_the_difference_of_means_by_hand():
+def test_directional_metric_by_hand():
     # ((3 - 0) + (5 - 1) + (1 - 2)) / 3 = 6 / 3
-    assert_allclose(
-        dg.directional_metric(jnp.array([3.0, 5.0, 1.0]), jnp.array([0.0, 1.0, 2.0])), 2.0
-    )
-
-
-def test_spectral_metric_weighs_sorted_quantiles_by_hand():
+    metric = dg.directional_metric
+    assert_allclose(metric(jnp.array([3.0, 5.0, 1.0]), jnp.array([0.0, 1.0, 2.0])), 2.0)
     # sorted u = 1 2 3 4, sorted v = 0 0 1 1: (2·(1-0) + 2·(2-0)) / 4 = 1.5
     u, v = jnp.array([4.0, 1.0, 3.0, 2.0]), jnp.array([0.0, 1.0, 0.0, 1.0])
-    assert_allclose(dg.directional_metric(u, v, CVAR_HALF), 1.5)
+    assert_allclose(metric(u, v, CVAR_HALF), 1.5)
+    assert_allclose(jax.jit(metric)(u, v, CVAR_HALF), 1.5)  # traced weights
 
 
-@pytest.mark.parametrize("weights", [None, CVAR_HALF, jnp.array([0.4, 0.8, 1.2, 1.6])])
+@pytest.mark.parametrize("weights", [None, CVAR_HALF])
 def test_metric_is_antisymmetric_and_equivariant(weights, key):
     u, v = jax.random.normal(key, (2, 7, 3, 4))
     d = dg.directional_metric(u, v, weights)
@@ -53,35 +50,18 @@ def test_equal_means_are_near_in_the_metric_and_far_in_wasserstein():
     assert_allclose(dg.wasserstein(wide, narrow), 9.0)
 
 
-@pytest.mark.parametrize(
-    "weights",
-    [
-        jnp.array([1.0, 2.0]),
-        jnp.array([3.0, -1.0]),
-        jnp.ones((2, 2)),
-        jnp.array([jnp.nan, 1.0]),
-        jnp.array([0.0, 1.0]),
-    ],
-)
+@pytest.mark.parametrize("weights", [[1.0, 2.0], [3.0, -1.0], [[1.0, 1.0]], [float("nan"), 1.0]])
 def test_weights_that_are_negative_or_not_of_mean_one_are_refused(weights):
     with pytest.raises(ValueError, match="of mean 1"):
         dg.directional_metric(jnp.zeros(2), jnp.zeros(2), weights)
 
 
-def test_weights_may_be_traced():
-    u, v = jnp.array([4.0, 1.0, 3.0, 2.0]), jnp.zeros(4)
-    assert_allclose(jax.jit(dg.directional_metric)(u, v, CVAR_HALF), 1.5)
-
-
 @pytest.mark.parametrize("p", [1.0, 2.0])
 def test_wasserstein_agrees_with_scipy(p, key):
     u, v = np.asarray(jax.random.normal(key, (2, 11)))
-    order = (
-        scipy.stats.wasserstein_distance(u, v)
-        if p == 1
-        else np.mean((np.sort(u) - np.sort(v)) ** 2) ** 0.5
-    )
-    assert_allclose(dg.wasserstein(jnp.asarray(u), jnp.asarray(v), p), order, rtol=1e-5)
+    second = np.mean((np.sort(u) - np.sort(v)) ** 2) ** 0.5
+    want = scipy.stats.wasserstein_distance(u, v) if p == 1 else second
+    assert_allclose(dg.wasserstein(jnp.asarray(u), jnp.asarray(v), p), want, rtol=1e-5)
 
 
 def test_monotone_quantiles_by_hand():
@@ -91,18 +71,13 @@ def test_monotone_quantiles_by_hand():
     assert_allclose(monotone_quantiles(jnp.array([1.0, 5.0, 5.0 + np.log(3)])), want, rtol=1e-6)
 
 
-@pytest.mark.parametrize("k", [1, 2, 64])
+@pytest.mark.parametrize("k", [1, 64])
 def test_monotone_quantiles_do_not_cross_and_have_the_given_mean(k, key):
     outputs = 10 * jax.random.normal(key, (100, k))
     z = monotone_quantiles(outputs)
     assert z.shape == (100, k)
     assert float(jnp.diff(z).min(initial=1)) > -1e-5
     assert_allclose(z.mean(-1), outputs[:, 0], atol=1e-4)
-
-
-def test_huber_is_quadratic_inside_and_linear_outside_by_hand():
-    # |u| ≤ 2: ½·1² = 0.5; beyond: 2·(5 - 1) = 8
-    assert_allclose(huber(jnp.array([1.0, -1.0, 5.0, -5.0]), 2.0)[0], [0.5, 0.5, 8.0, 8.0])
 
 
 def test_quantile_huber_loss_by_hand():
@@ -116,8 +91,12 @@ def test_quantile_huber_loss_by_hand():
     assert_allclose(dg.quantile_huber_loss(z, jnp.array([0.0])), 0.25 * 0.5)
 
 
-@pytest.mark.parametrize(("k", "j"), [(1, 1), (3, 40), (40, 3), (17, 16)])
-def test_quantile_huber_loss_and_its_gradients_match_numpy(k, j, key):
+@pytest.mark.parametrize(
+    ("k", "j", "device"), [(1, 1, "cpu"), (3, 40, "cpu"), (17, 16, "cpu"), (5, 6, "elsewhere")]
+)
+def test_quantile_huber_loss_and_its_gradients_match_numpy(k, j, device, key, request):
+    if device == "elsewhere":
+        request.getfixturevalue("elsewhere")
     z, y = 3 * jax.random.normal(key, (5, k)), 3 * jax.random.normal(jax.random.key(1), (2, 5, j))
 
     def laid_out(z, y, kappa):
@@ -129,39 +108,19 @@ def test_quantile_huber_loss_and_its_gradients_match_numpy(k, j, key):
         return loss.mean(-1).sum(-1), -slope.mean(-1).sum(0), slope.sum(-2) / j
 
     loss = jax.jit(lambda z, y: dg.quantile_huber_loss(z, y, kappa=0.7))
-    value, by_quantiles, by_target = laid_out(z, y, 0.7)
+    value, *slopes = laid_out(z, y, 0.7)
     assert_allclose(loss(z, y), value, rtol=1e-5)
-    assert_allclose(
-        jax.grad(lambda z, y: loss(z, y).sum(), argnums=0)(z, y), by_quantiles, rtol=1e-5, atol=1e-6
-    )
-    assert_allclose(
-        jax.grad(lambda z, y: loss(z, y).sum(), argnums=1)(z, y), by_target, rtol=1e-5, atol=1e-6
-    )
+    gradients = jax.grad(lambda z, y: loss(z, y).sum(), argnums=(0, 1))(z, y)
+    for got, want in zip(gradients, slopes, strict=True):
+        assert_allclose(got, want, rtol=1e-5, atol=1e-6)
 
 
-@pytest.mark.parametrize("i", range(4))
-def test_quantile_huber_loss_is_minimal_at_empirical_quantiles(i, key):
+def test_quantile_huber_loss_is_minimal_at_empirical_quantiles(key):
     # 101·τᵢ is no whole number for K = 4, so that the empirical quantile is one of the samples
     samples = jax.random.normal(key, (101,))
-    losses = jax.vmap(
-        lambda x: dg.quantile_huber_loss(jnp.zeros(4).at[i].set(x), samples, kappa=1e-3)
-    )(samples)
-    expected = np.quantile(
-        np.asarray(samples), float(dg.quantile_midpoints(4)[i]), method="inverted_cdf"
-    )
-    assert_allclose(samples[losses.argmin()], expected)
-
-
-def test_quantile_huber_loss_on_an_accelerator_is_that_on_a_cpu(elsewhere):
-    quantiles, target = jnp.asarray(np.random.default_rng(0).normal(size=(2, 6, 5)), jnp.float32)
-
-    def both():
-        return jax.value_and_grad(
-            lambda q, t: dg.quantile_huber_loss(q, t, kappa=0.7).sum(), argnums=(0, 1)
-        )(quantiles, target)
-
-    got = both()
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(jax.lax, "platform_dependent", lambda *args, cpu, **_: cpu(*args))
-        want = both()
-    jax.tree.map(lambda a, b: assert_allclose(a, b, atol=1e-6), got, want)
+    guesses = jnp.broadcast_to(samples[:, None], (101, 4))
+    by_quantile = jax.vmap(jax.vmap(lambda z: dg.quantile_huber_loss(z, samples, kappa=1e-3)))
+    losses = by_quantile(guesses[..., None] * jnp.eye(4))
+    taus = np.asarray(dg.quantile_midpoints(4))
+    want = np.quantile(np.asarray(samples), taus, method="inverted_cdf")
+    assert_allclose(samples[losses.argmin(0)], want)
