@@ -86,8 +86,9 @@ def make_train(algorithm: Algorithm, env: Env, config: ResolvedConfig) -> tuple[
             **{f"critic/{name}": value for name, value in critic_info.items()},
             **estimates,
         }
-        progress = key, state.iteration + 1, failures
-        return TrainState(policy, critic, obs_stats, reward_scale, episodes, *progress), metrics
+        iteration = state.iteration + 1
+        after = policy, critic, obs_stats, reward_scale, episodes, key, iteration, failures
+        return TrainState(*after), metrics
 
     return init, train_step
 

@@ -86,11 +86,12 @@ def _advance(episodes: Episodes, after: Any, step: Transition, fresh: Episodes) 
     """Return the envs after a step; where the episode ended, a fresh one begins."""
     done = step.terminated | step.truncated
     steps, total = episodes.steps + 1, episodes.total + step.reward
-    now = where(done, (fresh.env, fresh.steps, fresh.total), (after, steps, total))
+    anew = fresh.env, fresh.steps, fresh.total
+    state, now_steps, now_total = where(done, anew, (after, steps, total))
     return episodes._replace(
-        env=now[0],
-        steps=now[1],
-        total=now[2],
+        env=state,
+        steps=now_steps,
+        total=now_total,
         last_total=jnp.where(done, total, episodes.last_total),
         last_steps=jnp.where(done, steps, episodes.last_steps),
     )

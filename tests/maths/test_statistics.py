@@ -54,13 +54,8 @@ def test_crps_of_the_standard_normal_at_zero_has_its_known_value():
     assert_allclose(dg.crps(z, jnp.float32(0.0)), 0.233695, rtol=1e-3)
 
 
-@pytest.mark.parametrize(
-    ("scores", "mean"),
-    [
-        ([8, 1, 7, 2, 6, 3, 5, 4], 4.5),  # two of eight off at each end: (3 + 4 + 5 + 6) / 4
-        ([1, 2, 6], 3.0),  # ⌊3/4⌋ = 0
-    ],
-)
+# two of eight off at each end: (3 + 4 + 5 + 6) / 4; ⌊3/4⌋ = 0
+@pytest.mark.parametrize(("scores", "mean"), [([8, 1, 7, 2, 6, 3, 5, 4], 4.5), ([1, 2, 6], 3.0)])
 def test_interquartile_mean_leaves_out_a_quarter_at_each_end(scores, mean):
     assert dg.iqm(np.array(scores, float)) == mean
     assert dg.iqm(jnp.array(scores, float)) == mean
