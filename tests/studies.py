@@ -32,6 +32,13 @@ def finish(process):
     return process.returncode, out.splitlines(), err
 
 
+def succeed(process):
+    """Return the lines of a process that must end with exit code 0 and without errors."""
+    code, lines, errors = finish(process)
+    assert (code, errors) == (0, ""), lines
+    return lines
+
+
 def wait_for(what, seconds=240):
     """Wait until a condition holds."""
     deadline = time.monotonic() + seconds
@@ -46,7 +53,7 @@ def rows(sweep):
     return [{k: v for k, v in row.items() if k not in TIMES} for row in found]
 
 
-def children():
-    """Return the ids of the processes that this one started."""
-    found = subprocess.run(["ps", "--ppid", str(os.getpid()), "-o", "pid="], capture_output=True)
-    return [int(word) for word in found.stdout.split()]
+def first_child():
+    """Return the id of the first process that this one started and that still runs."""
+    found = subprocess.run(["pgrep", "--oldest", "-P", str(os.getpid())], capture_output=True)
+    return int(found.stdout)

@@ -1,6 +1,7 @@
-"""The outcome of a tuning: best.json, trials.csv, tuning.html and a printed table."""
+"""The outcome of a tuning: best.json, trials.csv, tuning.html and the best trials in print."""
 
 import base64
+import contextlib
 import csv
 import io
 import warnings
@@ -21,15 +22,11 @@ from dgae_jax.study.search import Tuning
 
 FINISHED = (TrialState.COMPLETE, TrialState.PRUNED)
 
-TOP = 10
-"""Trials that are printed."""
-
-PLOTS: dict[str, tuple[Callable[..., Any], int]] = {
-    "Return of each trial, and the best so far": (plots.plot_optimization_history, 1),
-    "Share of the spread that each setting explains": (plots.plot_param_importances, 4),
-    "Return by setting": (plots.plot_slice, 1),
+PLOTS = {
+    "Return of each trial, and the best so far": plots.plot_optimization_history,
+    "Share of the spread that each setting explains": plots.plot_param_importances,
+    "Return by setting": plots.plot_slice,
 }
-"""By title: Optuna's function, and the number of different returns that it needs."""
 
 
 def finished(study: Study) -> list[FrozenTrial]:
@@ -38,27 +35,33 @@ def finished(study: Study) -> list[FrozenTrial]:
 
 
 def say_new(study: Study, count: int) -> int:
-    """Print a line for each trial finished after the first `count`; return the new count."""
+    """Print the trials that finished after the first `count`, and return the new count."""
     trials = sorted(finished(study), key=lambda trial: trial.datetime_complete or trial.number)
     for trial in trials[count:]:
-        settings = ", ".join(f"{path} {_shown(value)}" for path, value in trial.params.items())
-        result = f"{trial.state.name.lower()}, return {_shown(trial.value)}"
-        terminal.say(f"trial {trial.number}: {result} ({settings})")
+        terminal.say(_line(trial))
     return len(trials)
+
+
+def _line(trial: FrozenTrial) -> str:
+    result = "none" if trial.value is None else f"{trial.value:,.1f}"
+    settings = ", ".join(f"{path} {_shown(value)}" for path, value in trial.params.items())
+    return f"trial {trial.number}: {trial.state.name.lower()}, return {result} ({settings})"
+
+
+def _shown(value: Any) -> str:
+    return f"{value:.5g}" if isinstance(value, float) else str(value)
 
 
 def write(tuning: Tuning, study: Study) -> int:
     """Write the files and print the best trials; return 1 if none was trained to its end."""
     trials, best_file = finished(study), tuning.directory / "best.json"
-
-    def row(trial: FrozenTrial) -> list[Any]:
+    text = io.StringIO()
+    table = csv.writer(text, lineterminator="\n")
+    table.writerow(["trial", "state", "return_mean", "seconds", *tuning.space])
+    for trial in trials:
         seconds = trial.duration.total_seconds() if trial.duration else None
         values = map(trial.params.get, tuning.space)
-        return [trial.number, trial.state.name.lower(), trial.value, seconds, *values]
-
-    text = io.StringIO()
-    head = ["trial", "state", "return_mean", "seconds", *tuning.space]
-    csv.writer(text, lineterminator="\n").writerows([head, *(row(trial) for trial in trials)])
+        table.writerow([trial.number, trial.state.name.lower(), trial.value, seconds, *values])
     files.replace(tuning.directory / "trials.csv", text.getvalue().encode())
     best = [trial for trial in trials if trial.state == TrialState.COMPLETE]
     best.sort(key=lambda trial: (-(trial.value or 0.0), trial.number))
@@ -68,33 +71,34 @@ def write(tuning: Tuning, study: Study) -> int:
         return 1
     config = tuning.trial_config(best[0].params).as_config().replace(seed=0, num_seeds=1)
     files.write_json(best_file, to_dict(config))
-    table = [head, *([_shown(value) for value in row(trial)] for trial in best[:TOP])]
-    count = len({trial.value for trial in best})
-    images = {name: _png(study, draw) for name, (draw, least) in PLOTS.items() if count >= least}
-    engine = engine_of(tuning.config, tuning.options.eval_engine)
     loader = jinja2.PackageLoader("dgae_jax.study")
     templates = jinja2.Environment(loader=loader, autoescape=True, trim_blocks=True)
     page = templates.get_template("tuning.html").render(
-        tuning=tuning, engine=engine, trials=len(trials), table=table, plots=images, best=best_file
+        tuning=tuning,
+        shown=_shown,
+        engine=engine_of(tuning.config, tuning.options.eval_engine),
+        count=len(trials),
+        best=best[:10],
+        plots={title: image for title, draw in PLOTS.items() if (image := _png(study, draw))},
+        best_file=best_file,
     )
     files.replace(tuning.directory / "tuning.html", page.encode())
-    widths = [max(map(len, column)) for column in zip(*table, strict=True)]
-    for cells in table:
-        terminal.say("  ".join(map(str.rjust, cells, widths)))
-    terminal.say(f"{len(best)} of {len(trials)} trials were trained to their end")
+    terminal.say(f"{len(best)} of {len(trials)} trials were trained to their end, the best are")
+    for trial in best[:10]:
+        terminal.say(_line(trial))
     terminal.say(f"train with the best settings: dgae train --config {best_file}")
     return 0
 
 
-def _shown(value: Any) -> str:
-    return f"{value:.5g}" if isinstance(value, float) else str(value)
-
-
 def _png(study: Study, draw: Callable[..., Any]) -> str:
-    """Return one of Optuna's plots as base64."""
+    """Return one of Optuna's plots as base64, nothing if the returns are too few or equal."""
     image = io.BytesIO()
     pyplot.switch_backend("agg")
-    with pyplot.style.context("default"), warnings.catch_warnings():
+    with (
+        pyplot.style.context("default"),
+        warnings.catch_warnings(),
+        contextlib.suppress(RuntimeError, ValueError),
+    ):
         warnings.simplefilter("ignore")  # of experimental functions, and of axes without an extent
         figure = np.ravel(draw(study, target_name="mean return"))[0].figure
         figure.savefig(image, format="png", dpi=120, bbox_inches="tight")

@@ -24,9 +24,6 @@ from dgae_jax.study.worker import Job, train_run
 POLL = 0.5
 """Time between looks at the tasks [s]."""
 
-TAIL = 16_384
-"""Bytes at the end of a metrics file that hold its last row."""
-
 MAX_POINTS = 200
 """Most points of a learning curve in the results."""
 
@@ -56,7 +53,9 @@ def reproduce(sweep: Sweep, runs: Sequence[RunSpec], options: RunOptions, launch
     jobs = [_job(sweep, run, options) for run in missing.values()]
     left = f", {len(jobs)} to train" if jobs else ""
     terminal.say(f"{sweep.path}: {len(runs) - len(jobs)} of {len(runs)} runs are done{left}")
-    progress, done, failed = Progress(sweep, list(missing.values())), [], []
+    configs = [run.config for run in missing.values()]
+    total = sum(c.iterations * c.samples_per_iteration * c.num_seeds for c in configs)
+    began, before, failed = time.monotonic(), _steps(sweep, missing), []
     with (
         Signals() as signals,
         terminal.Reporter() as reporter,
@@ -70,11 +69,14 @@ def reproduce(sweep: Sweep, runs: Sequence[RunSpec], options: RunOptions, launch
                     failed.append(run.name)
                     terminal.say(f"{run.name}: {reason}")
                     continue
-                done.append(run.name)
                 rows[run.name] = rows_of(sweep, run)
                 write_results(sweep, rows)
                 terminal.say(_summary(run, rows[run.name]))
-            reporter.watch(progress.line(len(done), len(failed)))
+            steps = _steps(sweep, missing)
+            speed = (steps - before) / (time.monotonic() - began)
+            left = terminal.clock((total - steps) / speed) if speed else "unknown"
+            runs_done = f"{len(jobs) - len(waiting)} of {len(jobs)} runs, {len(failed)} failed"
+            reporter.watch(f"{runs_done}; {steps:,} of {total:,} steps, time left {left}")
             time.sleep(POLL)
         if waiting:
             terminal.say(f"stopping {len(waiting)} runs")
@@ -111,35 +113,18 @@ def _summary(run: RunSpec, rows: Rows) -> str:
     return f"{run.name}: return {shown}, {rows[0]['samples_per_second']:,.0f} steps/s"
 
 
+def _steps(sweep: Sweep, runs: dict[str, RunSpec]) -> int:
+    return sum(reached(sweep, run) * run.config.num_seeds for run in runs.values())
+
+
 def reached(sweep: Sweep, run: RunSpec) -> int:
     """Return the steps in the last whole row of the metrics of a run."""
     try:
         with (sweep.run_dir(run) / "metrics.jsonl").open("rb") as file:
-            file.seek(max(0, file.seek(0, os.SEEK_END) - TAIL))
+            file.seek(max(0, file.seek(0, os.SEEK_END) - 16_384))  # a row is shorter
             return json.loads(file.read().rpartition(b"\n")[0].rpartition(b"\n")[2])["steps"]
     except (OSError, ValueError, LookupError, TypeError):
         return 0
-
-
-class Progress:
-    """How far the runs are."""
-
-    def __init__(self, sweep: Sweep, runs: Sequence[RunSpec]):
-        self.sweep, self.runs, self.began = sweep, runs, time.monotonic()
-        self.before = self._steps()
-
-    def _steps(self) -> int:
-        return sum(reached(self.sweep, run) * run.config.num_seeds for run in self.runs)
-
-    def line(self, done: int, failed: int) -> str:
-        """Return counts of runs and steps, and the time left at the speed so far."""
-        configs = [run.config for run in self.runs]
-        total = sum(c.iterations * c.samples_per_iteration * c.num_seeds for c in configs)
-        steps, seconds = self._steps(), time.monotonic() - self.began
-        made = steps - self.before
-        clock = terminal.clock((total - steps) * seconds / made) if made else "unknown"
-        counts = f"{done} done, {failed} failed of {len(self.runs)} runs"
-        return f"{counts}; {steps:,} of {total:,} steps, time left {clock}"
 
 
 def is_done(sweep: Sweep, run: RunSpec) -> bool:

@@ -28,23 +28,22 @@ class Values:
     """The values that trials may give to a setting."""
 
     text: str
-    """The values as they were written."""
     ends: Sequence[Any]
     """Lowest and highest value, or all choices."""
     kind: str
     """float, int or categorical, as in the methods of Optuna's `Trial`."""
-    options: Mapping[str, Any]
+    is_log: bool = False
 
     def suggest(self, trial: Any, path: str) -> Any:
         """Return the value that Optuna suggests for the setting in a trial."""
-        ends = [self.ends] if self.kind == "categorical" else self.ends
-        return getattr(trial, f"suggest_{self.kind}")(path, *ends, **self.options)
+        if self.kind == "categorical":
+            return trial.suggest_categorical(path, self.ends)
+        return getattr(trial, f"suggest_{self.kind}")(path, *self.ends, log=self.is_log)
 
     def include(self, value: Any) -> bool:
         """Return whether a trial could give this value."""
-        if self.kind == "categorical":
-            return value in self.ends
-        return self.ends[0] <= value <= self.ends[1]
+        is_choice = self.kind == "categorical"
+        return value in self.ends if is_choice else self.ends[0] <= value <= self.ends[1]
 
 
 @dataclass(frozen=True)
@@ -76,10 +75,9 @@ class Tuning:
 
     def start_values(self) -> dict[str, Any] | None:
         """Return the configuration's own values; None if one of them is outside the space."""
-        config = self.config.as_config()
-        values = {path: _as_choice(config.get(path)) for path in self.space}
-        inside = all(self.space[path].include(value) for path, value in values.items())
-        return values if inside else None
+        values = {path: self.config.as_config().get(path) for path in self.space}
+        values |= {k: "x".join(map(str, v)) for k, v in values.items() if isinstance(v, tuple)}
+        return values if all(self.space[k].include(v) for k, v in values.items()) else None
 
 
 def space_of(words: Sequence[str], config: ResolvedConfig) -> dict[str, Values]:
@@ -116,15 +114,15 @@ def space_of(words: Sequence[str], config: ResolvedConfig) -> dict[str, Values]:
 def _values(text: str) -> Values:
     """Parse the part after `=`; raise ValueError."""
     if found := re.fullmatch(r"(int:)?(log:)?([^:,]+):([^:,]+)", text):
-        is_int, is_log, *ends = found.groups()
-        low, high = map(int if is_int else float, ends)
+        kind, is_log = int if found[1] else float, bool(found[2])
+        low, high = kind(found[3]), kind(found[4])
         if not low < high or (is_log and low <= 0):
             raise ValueError(text)
-        return Values(text, (low, high), "int" if is_int else "float", {"log": bool(is_log)})
+        return Values(text, (low, high), kind.__name__, is_log)
     choices = tuple(map(_choice, text.split(",")))
     if len(set(choices)) != len(choices) or len(choices) < 2 or "" in choices:
         raise ValueError(text)
-    return Values(text, choices, "categorical", {})
+    return Values(text, choices, "categorical")
 
 
 def _choice(text: str) -> Any:
@@ -133,10 +131,6 @@ def _choice(text: str) -> Any:
         return json.loads(text)
     except ValueError:
         return text
-
-
-def _as_choice(value: Any) -> Any:
-    return _choice("x".join(map(str, value))) if isinstance(value, tuple) else value
 
 
 def _with_values(config: ResolvedConfig, values: Mapping[str, Any]) -> ResolvedConfig:

@@ -32,11 +32,6 @@ from dgae_jax.study.worker import Job
 QUARTERS = 4
 """Parts of a trial; at the end of each but the last a trial worse than the median is pruned."""
 
-MAX_RETRIES = 5
-"""Retries of a trial after its process is lost, perhaps because of its settings."""
-
-TAKEN = (*outcome.FINISHED, TrialState.RUNNING)
-
 POLL = 0.5
 """Time between looks at the study [s]."""
 
@@ -116,19 +111,19 @@ def open_study(tuning: Tuning, worker: int = 0) -> Study:
 
 
 def _retry(study: Study, trial: FrozenTrial) -> None:
-    """Enqueue a trial again, with what it has reported."""
-    RetryHeartbeatStaleTrialCallback(MAX_RETRIES, inherit_intermediate_values=True)(study, trial)
+    """Enqueue a trial again, with what it has reported; its settings may be what kills it."""
+    RetryHeartbeatStaleTrialCallback(5, inherit_intermediate_values=True)(study, trial)
 
 
 def _check_same(study: Study, tuning: Tuning) -> None:
     """Write what is tuned, or refuse to tune anything else in this study."""
-    ours = {
-        **flat(json.loads(json.dumps(to_dict(tuning.config)))),
-        **{f"search {path}": each.text for path, each in tuning.space.items()},
+    judged = {
         "tuning_seeds": tuning.seeds,
         "episodes": tuning.options.episodes,
         "eval_engine": engine_of(tuning.config, tuning.options.eval_engine),
+        "search": {path: each.text for path, each in tuning.space.items()},
     }
+    ours = flat(json.loads(json.dumps({**to_dict(tuning.config), **judged})))
     theirs = study.user_attrs.get("tuning", ours)
     study.set_user_attr("tuning", theirs)
     for name in {**ours, **theirs}:
@@ -141,21 +136,22 @@ def work(tuning: Tuning, number: int = 0) -> int:
     """Train trials until enough are finished, here or elsewhere; return the exit code."""
     warnings.filterwarnings("ignore", "The reported value is ignored")  # by a trial that resumes
     config = replace(tuning.config, num_seeds=tuning.seeds)
-    try:
-        # a fault of the machine must not count against the settings of a trial
-        training.prepare(config, replace(tuning.options, num_processes=1))
-        study = open_study(tuning, 1 + number)
-        while len(outcome.finished(study)) < tuning.trials:
-            optuna.storages.fail_stale_trials(study)
-            taken = study.get_trials(deepcopy=False, states=TAKEN)
-            # a trial that was taken but has no values lost its process before its first heartbeat
-            if sum(bool(trial.params) for trial in taken) < tuning.trials:
+    # a fault of the machine must not count against the settings of a trial
+    training.prepare(config, replace(tuning.options, num_processes=1))
+    study = open_study(tuning, 1 + number)
+    while len(outcome.finished(study)) < tuning.trials:
+        optuna.storages.fail_stale_trials(study)
+        states = (*outcome.FINISHED, TrialState.RUNNING)
+        taken = study.get_trials(deepcopy=False, states=states)
+        # a trial that was taken but has no values lost its process before its first heartbeat
+        if sum(bool(trial.params) for trial in taken) < tuning.trials:
+            try:
                 study.optimize(partial(_train, tuning, study), n_trials=1)
-            else:
-                time.sleep(POLL)
-    except RunError as end:
-        terminal.say(str(end))
-        return end.exit_code
+            except RunError as end:
+                terminal.say(str(end))
+                return end.exit_code
+        else:
+            time.sleep(POLL)
     return 0
 
 
@@ -167,7 +163,6 @@ def _train(tuning: Tuning, study: Study, trial: Trial) -> float:
     values = {path: each.suggest(trial, path) for path, each in tuning.space.items()}
     number = trial.user_attrs.get("run", trial.number)  # a retry has the attributes of the trial
     trial.set_user_attr("run", number)
-    terminal.say(f"trial {trial.number}: {values}")
     try:
         config = tuning.trial_config(values)
         every = -(-config.iterations // QUARTERS) * config.samples_per_iteration

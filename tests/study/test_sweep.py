@@ -30,25 +30,24 @@ def names(runs):
 
 
 def test_the_first_seeds_of_all_pairs_come_first():
-    assert names(grid())[:5] == [
-        "hopper-ppo-0", "hopper-dppo-0", "ant-ppo-0", "ant-dppo-0", "hopper-ppo-1",
-    ]  # fmt: skip
+    runs = ["hopper-ppo-0", "hopper-dppo-0", "ant-ppo-0", "ant-dppo-0", "hopper-ppo-1"]
+    assert names(grid())[:5] == runs
     assert [run.label for run in grid()][:4] == ["ppo", "dppo", "ppo", "dppo"]
 
 
 def test_several_seeds_of_a_run_must_be_consecutive():
-    runs = grid((0, 1, 2, 3), 2)
-    assert names(runs)[::4] == ["hopper-ppo-0-1", "hopper-ppo-2-3"]
-    assert [(run.config.seed, run.config.num_seeds) for run in runs][::4] == [(0, 2), (2, 2)]
+    runs = grid((0, 1, 2, 3), 2)[::4]
+    assert names(runs) == ["hopper-ppo-0-1", "hopper-ppo-2-3"]
+    assert [(run.config.seed, run.config.num_seeds) for run in runs] == [(0, 2), (2, 2)]
     with pytest.raises(ConfigError, match=r"seeds_per_run 2: must be 1, .* not \[0, 2\]"):
         grid((0, 2, 3, 4), 2)
 
 
 def test_a_variant_names_the_run_instead_of_the_algorithm():
-    (run,) = sweeps.grid(
-        ["brax:ant"], ["kappa-0.1"], (3, 4), 2, lambda task, _: resolve(dg.Config(env=task))
-    )
-    assert (run.name, run.label) == ("brax_ant-kappa-0.1-3-4", "kappa-0.1")
+    (run,) = sweeps.grid(["brax:ant"], ["kappa-0.1"], (3, 4), 2, lambda *_: make("ant", "dppo"))
+    assert run.name == "brax_ant-kappa-0.1-3-4"
+    (run,) = sweeps.grid(["ant"], ["kappa-0.1"], (3, 4), 2, make=lambda *_: make("ant", "dppo"))
+    assert run.label == "kappa-0.1"
 
 
 @pytest.mark.parametrize("question", VARIANTS)
@@ -82,21 +81,15 @@ def test_another_configuration_of_a_run_is_refused(tmp_path):
     assert (tmp_path / "study.json").read_bytes() == before
 
 
-def test_a_sweep_is_open_once(tmp_path):
-    with (
-        sweeps.opened(tmp_path, grid(), "one"),
-        pytest.raises(ConfigError, match="must not be in use"),
-        sweeps.opened(tmp_path, grid(), ""),
-    ):
-        pass
-
-
-def test_a_directory_of_something_else_is_left_alone(tmp_path):
-    (tmp_path / "thesis.tex").touch()
+def test_a_directory_in_use_or_of_something_else_is_refused(tmp_path):
+    with sweeps.opened(tmp_path / "sweep", grid(), "one"):
+        message = "must not be in use"
+        with pytest.raises(ConfigError, match=message), sweeps.opened(tmp_path / "sweep", [], ""):
+            pass
     message = "must be a sweep, or a new or empty directory"
     with pytest.raises(ConfigError, match=message), sweeps.opened(tmp_path, grid(), ""):
         pass
-    assert [path.name for path in tmp_path.iterdir()] == ["thesis.tex"]
+    assert [path.name for path in tmp_path.iterdir()] == ["sweep"]
 
 
 @pytest.mark.parametrize(
