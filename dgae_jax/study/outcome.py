@@ -1,7 +1,6 @@
 """The outcome of a tuning: best.json, trials.csv, tuning.html and the best trials in print."""
 
 import base64
-import contextlib
 import csv
 import io
 import warnings
@@ -22,11 +21,12 @@ from dgae_jax.study.search import Tuning
 
 FINISHED = (TrialState.COMPLETE, TrialState.PRUNED)
 
-PLOTS = {
-    "Return of each trial, and the best so far": plots.plot_optimization_history,
-    "Share of the spread that each setting explains": plots.plot_param_importances,
-    "Return by setting": plots.plot_slice,
+PLOTS: dict[str, tuple[Callable[..., Any], int]] = {
+    "Return of each trial, and the best so far": (plots.plot_optimization_history, 1),
+    "Share of the spread that each setting explains": (plots.plot_param_importances, 4),
+    "Return by setting": (plots.plot_slice, 1),
 }
+"""By title: Optuna's function, and the number of different returns below which it says nothing."""
 
 
 def finished(study: Study) -> list[FrozenTrial]:
@@ -71,15 +71,16 @@ def write(tuning: Tuning, study: Study) -> int:
         return 1
     config = tuning.trial_config(best[0].params).as_config().replace(seed=0, num_seeds=1)
     files.write_json(best_file, to_dict(config))
+    count = len({trial.value for trial in best})
     loader = jinja2.PackageLoader("dgae_jax.study")
     templates = jinja2.Environment(loader=loader, autoescape=True, trim_blocks=True)
     page = templates.get_template("tuning.html").render(
         tuning=tuning,
         shown=_shown,
         engine=engine_of(tuning.config, tuning.options.eval_engine),
-        count=len(trials),
+        trials=len(trials),
         best=best[:10],
-        plots={title: image for title, draw in PLOTS.items() if (image := _png(study, draw))},
+        plots={name: _png(study, draw) for name, (draw, least) in PLOTS.items() if count >= least},
         best_file=best_file,
     )
     files.replace(tuning.directory / "tuning.html", page.encode())
@@ -91,14 +92,10 @@ def write(tuning: Tuning, study: Study) -> int:
 
 
 def _png(study: Study, draw: Callable[..., Any]) -> str:
-    """Return one of Optuna's plots as base64, nothing if the returns are too few or equal."""
+    """Return one of Optuna's plots as base64."""
     image = io.BytesIO()
     pyplot.switch_backend("agg")
-    with (
-        pyplot.style.context("default"),
-        warnings.catch_warnings(),
-        contextlib.suppress(RuntimeError, ValueError),
-    ):
+    with pyplot.style.context("default"), warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of experimental functions, and of axes without an extent
         figure = np.ravel(draw(study, target_name="mean return"))[0].figure
         figure.savefig(image, format="png", dpi=120, bbox_inches="tight")

@@ -157,15 +157,16 @@ def test_a_machine_that_cannot_train_takes_no_trial(tmp_path):
     assert [trial.state for trial in open_study(ours).trials] == [TrialState.WAITING]
 
 
-def test_a_single_trial_has_no_importances(tmp_path):
+@pytest.mark.parametrize(("spread", "images"), [(0.0, 2), (100.0, 3)])
+def test_importances_are_plotted_where_returns_differ(tmp_path, spread, images):
     ours = tuning(tmp_path)
     study = open_study(ours)
     space = dict.fromkeys(ours.space, optuna.distributions.FloatDistribution(0.8, 1.0))
-    for count, images in ((1, 2), (2, 3)):
-        params = {"gamma": 0.9 + count / 100, "gae_lambda": 0.9}
-        study.add_trial(create_trial(params=params, distributions=space, value=float(count)))
-        assert outcome.write(ours, study) == 0
-        assert (ours.directory / "tuning.html").read_text().count("<img") == images
+    for gamma in (0.91, 0.92, 0.93, 0.94):
+        params, value = {"gamma": gamma, "gae_lambda": 0.9}, spread * gamma
+        study.add_trial(create_trial(params=params, distributions=space, value=value))
+    assert outcome.write(ours, study) == 0
+    assert (ours.directory / "tuning.html").read_text().count("<img") == images
 
 
 def test_a_database_that_is_not_there_is_refused_without_its_password(tmp_path):
