@@ -91,15 +91,13 @@ def render(args: RenderArguments) -> None:
     file = args.stem.with_name(f"{args.stem.name}.{formats[0]}")
     with args.writing(file, configs[0]) as watch:
         from dgae_jax.export import video
+        from dgae_jax.run.episodes import episode_seeds
 
-        clip = video.Clip(args.episodes, args.seed, args.seconds)
-        if args.during:
-            scenes = video.of_checkpoints(args.run_dir, configs[0], args.index, clip)
-        else:
-            runs = list(zip(titles(sources), sources, configs, strict=True))
-            scenes = video.of_runs(runs, args.checkpoint, args.index, clip)
+        runs = list(zip(titles(sources), sources, configs, strict=True))
+        actors = video.actors(runs, "all" if args.during else args.checkpoint, args.index)
+        seeds = episode_seeds(args.seed, args.episodes)
         size = args.width // 2 * 2, args.height // 2 * 2
-        frames = video.frames(scenes, *size, args.fps, watch)
+        frames = video.frames(actors, seeds, args.seconds, size, args.fps, watch)
         written = encoding.write(frames, args.stem, formats, args.fps)
     for path in written:
         terminal.say(f"written to {path} ({path.stat().st_size / 1e6:.1f} MB)")

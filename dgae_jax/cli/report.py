@@ -44,7 +44,7 @@ def report(args: Arguments) -> None:
     from dgae_jax.report import groups, markdown, page
 
     if args.markdown:
-        markdown.check(args.markdown, sweeps[0].name)
+        markdown.find(args.markdown, sweeps[0].name)
     for sweep in sweeps if args.videos else ():
         _write_videos(sweep)
     for path in page.write(sweeps, out, published):

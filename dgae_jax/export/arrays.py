@@ -32,17 +32,9 @@ from dgae_jax.run.options import eval_env_id
 
 Arrays = dict[str, np.ndarray]
 
-TOLERANCE = 1e-4
-"""Largest difference, absolute and relative, between outputs of the arrays and of the policy."""
-
 
 def arrays_of(found: Networks, config: ResolvedConfig, index: int) -> Arrays:
-    """Return the arrays of one seed's policy.
-
-    Args:
-        found: the networks of all seeds that were trained together.
-        config: of the run.
-        index: which of the seeds, from 0.
+    """Return the arrays of one of the policies that were trained together.
 
     Raises:
         ConfigError: the arrays do not compute what the policy does, as its networks are custom.
@@ -72,8 +64,8 @@ def _arrays(policy: InferenceState, critic: InferenceState, config: ResolvedConf
     values = {"observation_mean": mean, "observation_std": std, "observation_limit": limit}
     values |= {"action_low": low, "action_high": high}
     arrays |= {name: np.asarray(value, np.float32) for name, value in values.items()}
-    names = {"env": eval_env_id(config), "episode_length": time_limit(config)}
-    return arrays | {name: np.array(value) for name, value in names.items()}
+    task = {"env": np.array(eval_env_id(config)), "episode_length": np.array(time_limit(config))}
+    return arrays | task
 
 
 def to_npz(arrays: Arrays) -> bytes:
@@ -107,6 +99,6 @@ def _compare(arrays: Arrays, policy: Policy) -> None:
     exported = NumpyPolicy(io.BytesIO(to_npz(arrays)))
     noise = np.random.default_rng(0).normal(size=(100, policy.observation_size))
     obs = arrays["observation_mean"] + 3 * noise * arrays["observation_std"]
-    close = partial(np.testing.assert_allclose, rtol=TOLERANCE, atol=TOLERANCE)
+    close = partial(np.testing.assert_allclose, rtol=1e-4, atol=1e-4)
     close(exported(obs), policy(obs), err_msg="actions differ")
     close(exported.quantiles(obs), policy.quantiles(obs), err_msg="quantiles differ")

@@ -25,16 +25,7 @@ COLORS = {
 }
 """Okabe and Ito (2008), for readers with any color vision; `plan` is a darker purple."""
 
-PAPER: Any = {
-    "font.family": "STIXGeneral",
-    "mathtext.fontset": "stix",
-    "font.size": 10,
-    "axes.linewidth": 0.8,
-    "svg.hashsalt": "dgae_jax",
-}
-"""Matplotlib's settings for a paper; with the hash salt an SVG has the same bytes each time."""
-
-_UNDATED = {"svg": {"Date": None}, "png": {"Software": None}}
+STYLE = Path(__file__).parent / "templates" / "paper.mplstyle"
 
 POSES = {
     "ant": (0, 0, 0.62, 1, 0, 0, 0, 0, 1, 0, -1, 0, -1, 0, 1),
@@ -44,17 +35,11 @@ POSES = {
 }
 """Positions that show each robot's shape (m, rad; a quaternion for the ant)."""
 
-PIXELS = 640
-"""Width and height of each robot's panel."""
-
 LOWER, HIGHER = NormalDist(2.4, 0.55), NormalDist(5.4, 0.8)
 """The distributions of Fig. 2; each is U in one column and V in the other."""
 
 RANGE = (0.0, 8.6)
 """x_min and x_max."""
-
-QUANTILES = 1000
-"""Number of midpoints on which distances are computed."""
 
 LEVELS = (0.1, 0.3, 0.5, 0.7, 0.9)
 """Probabilities at which the transfer plan is drawn."""
@@ -62,10 +47,9 @@ LEVELS = (0.1, 0.3, 0.5, 0.7, 0.9)
 
 def save(figure: Figure, path: Path, dpi: int = 200) -> None:
     """Write a PNG or an SVG, by the suffix of `path`, complete or not at all."""
-    image, kind = io.BytesIO(), path.suffix[1:]
-    frame: Any = {"bbox_inches": "tight", "pad_inches": 0.03}
-    with matplotlib.rc_context(PAPER):
-        figure.savefig(image, format=kind, dpi=dpi, metadata=_UNDATED[kind], **frame)
+    image, frame = io.BytesIO(), {"bbox_inches": "tight", "pad_inches": 0.03}
+    with matplotlib.rc_context(fname=STYLE):
+        figure.savefig(image, format=path.suffix[1:], dpi=dpi, metadata={"Date": None}, **frame)
     files.replace(path, image.getvalue())
 
 
@@ -73,12 +57,12 @@ def robots() -> Figure:
     """Draw Fig. 1: the four robots, in panels (a) to (d)."""
     from dgae_jax.export.renderer import Renderer  # here, as it needs OpenGL
 
-    with matplotlib.rc_context(PAPER):
+    with matplotlib.rc_context(fname=STYLE):
         figure = Figure(figsize=(7.2, 2.1), layout="constrained")
         panels = zip(figure.subplots(1, 4), "abcd", POSES.items(), strict=True)
         for axes, letter, (env, pose) in panels:
-            with Renderer(env, None, width=PIXELS, height=PIXELS) as renderer:
-                axes.imshow(renderer.render(np.array(pose, float)))
+            with Renderer(env, None, 640, 640) as renderer:
+                axes.imshow(renderer.draw(np.array(pose)))
             axes.set(xticks=[], yticks=[])
             axes.set_xlabel(f"({letter}) {env.capitalize()}", labelpad=4)
             axes.spines[:].set(linewidth=0.5, color="0.6")
@@ -87,7 +71,7 @@ def robots() -> Figure:
 
 def distances(u: NormalDist, v: NormalDist) -> list[float]:
     """Return the Wasserstein distance, d(F_U, G_V) and d(G_V, F_U) on the quantile midpoints."""
-    levels = [float(q) for q in quantile_midpoints(QUANTILES)]
+    levels = [float(q) for q in quantile_midpoints(1000)]
     f, g = (jnp.array([one.inv_cdf(q) for q in levels]) for one in (u, v))
     return list(map(float, (wasserstein(f, g), directional_metric(f, g), directional_metric(g, f))))
 
@@ -97,7 +81,7 @@ def transport() -> Figure:
 
     The Wasserstein distance is the same both ways; the directional metric tells them apart.
     """
-    with matplotlib.rc_context(PAPER):
+    with matplotlib.rc_context(fname=STYLE):
         figure = Figure(figsize=(7.2, 4.0), layout=ConstrainedLayoutEngine(wspace=0.08))
         panels = figure.subplots(
             2, 2, sharex=True, sharey="row", gridspec_kw={"height_ratios": [1.15, 1]}
@@ -107,15 +91,9 @@ def transport() -> Figure:
             _densities(upper, u, v)
             _distribution_functions(lower, u, v)
             lower.set_xlabel("$x$", labelpad=-8)
-            d, *signed = distances(u, v)
-            forward, backward = (
-                f"{{{x:+.2f}".replace("+", "+}").replace("-", "-}") for x in signed
-            )
-            upper.set_title(
-                f"({letter})  $d_1 = {d:.2f}$,   $d(F_U, G_V) = {forward}$,"
-                f"   $d(G_V, F_U) = {backward}$",
-                fontsize=10,
-            )
+            d, forward, backward = distances(u, v)
+            signed = f"$d(F_U, G_V) = {forward:+.2f}$,   $d(G_V, F_U) = {backward:+.2f}$"
+            upper.set_title(f"({letter})  $d_1 = {d:.2f}$,   {signed}", fontsize=10)
         panels[0, 0].set_ylabel("density")
         panels[1, 0].set_ylabel("distribution function")
     return figure
@@ -152,6 +130,6 @@ def _distribution_functions(axes: Any, u: NormalDist, v: NormalDist) -> None:
 
 
 def _arrow(start: Any, end: Any, curve: str, head: float, width: float) -> FancyArrowPatch:
-    look: Any = {"color": COLORS["plan"], "shrinkA": 1, "shrinkB": 1, "zorder": 3}
+    style: Any = {"color": COLORS["plan"], "linewidth": width, "zorder": 3}
     shape: Any = {"connectionstyle": curve, "arrowstyle": "-|>", "mutation_scale": head}
-    return FancyArrowPatch(start, end, linewidth=width, **shape, **look)
+    return FancyArrowPatch(start, end, shrinkA=1, shrinkB=1, **shape, **style)

@@ -20,9 +20,6 @@ _TRIAL = (
     "import mujoco; mujoco.Renderer(mujoco.MjModel.from_xml_string('<mujoco/>'), 16, 16).render()"
 )
 
-_TIMEOUT = 60
-"""Seconds after which a candidate counts as broken."""
-
 
 def choose() -> str:
     """Set MUJOCO_GL to a backend that works; call this before MuJoCo is imported.
@@ -38,23 +35,18 @@ def choose() -> str:
         if works(backend):
             os.environ[VARIABLE] = backend
             return backend
-    if chosen:
-        raise ConfigError(
-            f"{VARIABLE}={chosen}: cannot draw here; unset it, or try {', '.join(CANDIDATES)}"
-        )
-    raise ConfigError(
-        f"{VARIABLE}: cannot draw with {' or '.join(CANDIDATES)}; "
-        "on Debian: apt install libegl1 libgl1-mesa-dri, or libosmesa6"
-    )
+    remedy = "unset it" if chosen else "apt install libegl1 libgl1-mesa-dri, or libosmesa6"
+    tried = chosen or " or ".join(CANDIDATES)
+    raise ConfigError(f"{VARIABLE}: cannot draw with {tried}; {remedy}")
 
 
 @functools.cache
 def works(backend: str) -> bool:
-    """Return whether MuJoCo can draw with this backend."""
+    """Return whether MuJoCo can draw with this backend, within a minute."""
     environment = {**os.environ, VARIABLE: backend}
     command = [sys.executable, "-c", _TRIAL]
     try:
-        done = subprocess.run(command, env=environment, capture_output=True, timeout=_TIMEOUT)
-    except subprocess.TimeoutExpired:
+        subprocess.run(command, env=environment, capture_output=True, timeout=60, check=True)
+    except subprocess.SubprocessError:
         return False
-    return done.returncode == 0
+    return True

@@ -23,20 +23,9 @@ def check_installed() -> None:
 
 
 def serialize(arrays: Mapping[str, np.ndarray], metadata: Mapping[str, str]) -> bytes:
-    """Return the bytes of an `.onnx` file, checked by ONNX.
-
-    Args:
-        arrays: as `arrays.arrays_of` returns them.
-        metadata: strings by name, kept in the model.
-    """
+    """Return the bytes of an `.onnx` file with these arrays and metadata, checked by ONNX."""
     import onnx
 
-    sizes = {
-        "obs": arrays["observation_mean"].size,
-        "action": arrays["action_low"].size,
-        "quantiles": arrays[f"critic_bias_{_depth('critic', arrays) - 1}"].size,
-    }
-    obs, *outputs = (f"float[batch, {size}] {name}" for name, size in sizes.items())
     nodes = [
         "centered = Sub(obs, observation_mean)",
         "scaled = Div(centered, observation_std)",
@@ -44,16 +33,31 @@ def serialize(arrays: Mapping[str, np.ndarray], metadata: Mapping[str, str]) -> 
         *_network("policy", arrays, "mean"),
         "not_too_low = Max(mean, action_low)",  # Clip has one range for all actuators
         "action = Min(not_too_low, action_high)",
-        *_critic(arrays),
     ]
-    graph = f"policy ({obs}) => ({', '.join(outputs)})"
-    model = onnx.parser.parse_model("\n".join([HEADER, graph, "{", *nodes, "}"]))
     constants = {name: x for name, x in arrays.items() if x.dtype == np.float32}
     constants["observation_lowest"] = -arrays["observation_limit"]
     if "critic_count" in arrays:
         constants["critic_count"] = arrays["critic_count"]
-    if "critic_steps" in arrays:
+        nodes += [
+            *_network("critic", arrays, "outputs"),
+            "quantiles, ranks = TopK <axis = -1, largest = 0> (outputs, critic_count)",
+        ]
+    elif "critic_steps" in arrays:
         constants["critic_parts"] = np.array([1, len(arrays["critic_steps"])])
+        nodes += [
+            *_network("critic", arrays, "outputs"),
+            "mean_return, raw_gaps = Split <axis = -1> (outputs, critic_parts)",
+            "gaps = Softplus(raw_gaps)",
+            "centered_cumsum = MatMul(gaps, critic_steps)",
+            "quantiles = Add(mean_return, centered_cumsum)",
+        ]
+    else:
+        nodes += _network("critic", arrays, "quantiles")
+    *_, count = (x.size for name, x in arrays.items() if name.startswith("critic_bias_"))
+    sizes = arrays["observation_mean"].size, arrays["action_low"].size, count
+    obs, action, quantiles = (f"float[batch, {size}]" for size in sizes)
+    graph = f"policy ({obs} obs) => ({action} action, {quantiles} quantiles)"
+    model = onnx.parser.parse_model("\n".join([HEADER, graph, "{", *nodes, "}"]))
     model.graph.initializer.extend(
         onnx.numpy_helper.from_array(np.asarray(x), name) for name, x in constants.items()
     )
@@ -62,32 +66,13 @@ def serialize(arrays: Mapping[str, np.ndarray], metadata: Mapping[str, str]) -> 
     return model.SerializeToString()
 
 
-def _depth(network: str, arrays: Mapping[str, np.ndarray]) -> int:
-    return sum(name.startswith(f"{network}_weight_") for name in arrays)
-
-
 def _network(name: str, arrays: Mapping[str, np.ndarray], output: str) -> list[str]:
-    nodes, x, last = [], "normalized", _depth(name, arrays) - 1
-    for i in range(last):
+    *hidden, last = range(sum(key.startswith(f"{name}_weight_") for key in arrays))
+    nodes, x = [], "normalized"
+    for i in hidden:
         nodes += [
             f"{name}_linear_{i} = Gemm({x}, {name}_weight_{i}, {name}_bias_{i})",
             f"{name}_hidden_{i} = Tanh({name}_linear_{i})",
         ]
         x = f"{name}_hidden_{i}"
     return [*nodes, f"{output} = Gemm({x}, {name}_weight_{last}, {name}_bias_{last})"]
-
-
-def _critic(arrays: Mapping[str, np.ndarray]) -> list[str]:
-    """Make its outputs quantiles in increasing order, as the kind of critic needs."""
-    if "critic_count" in arrays:
-        sort = "quantiles, ranks = TopK <axis = -1, largest = 0> (outputs, critic_count)"
-        return [*_network("critic", arrays, "outputs"), sort]
-    if "critic_steps" not in arrays:
-        return _network("critic", arrays, "quantiles")
-    return [
-        *_network("critic", arrays, "outputs"),
-        "mean_return, raw_gaps = Split <axis = -1> (outputs, critic_parts)",
-        "gaps = Softplus(raw_gaps)",
-        "centered_cumsum = MatMul(gaps, critic_steps)",
-        "quantiles = Add(mean_return, centered_cumsum)",
-    ]

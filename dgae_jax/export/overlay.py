@@ -5,11 +5,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float, UInt8
 from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
-from matplotlib.lines import Line2D
 
-from dgae_jax.configs.resolved import ResolvedConfig
 from dgae_jax.export.figures import COLORS
 from dgae_jax.maths.risk import weights_of
 
@@ -18,26 +15,19 @@ HEIGHT = 132
 
 DPI = 100
 
-POINTS = 200
-"""Resolution of the density."""
-
 RUG = 0.35
 """Length of the longest line of the rug; the highest density of most states is 1."""
-
-DASHED = (0, (2, 1))
 
 
 class Episode(NamedTuple):
     """The states of an episode, each before its action, with predictions and outcomes."""
 
     title: str
-    config: ResolvedConfig
+    metric: str
+    """The risk measure."""
     dt: float
     """Between two states [s]."""
-    fell: bool
-    """Whether the robot became unhealthy after the last state."""
     qpos: Float[np.ndarray, "T Q"]
-    qvel: Float[np.ndarray, "T V"]
     total: Float[np.ndarray, " T"]
     """Undiscounted return so far."""
     quantiles: Float[np.ndarray, "T K"]
@@ -57,28 +47,21 @@ class Overlay:
         self._figure = Figure(figsize=(width / DPI, HEIGHT / DPI), dpi=DPI, facecolor="white")
         self._canvas = FigureCanvasAgg(self._figure)
         size = float(np.clip(8 * width / 480, 5.5, 9))
-        self._axes = _axes(self._figure, size, _limits(episode))
+        axes = _axes(self._figure, size, episode)
         most = int(0.5 * width / (0.85 * size))
         title = episode.title if len(episode.title) <= most else "…" + episode.title[1 - most :]
         self._figure.text(0.02, 0.97, title, size=size + 1, weight="bold", va="top")
+        self._is_distribution = episode.quantiles.shape[-1] > 1
+        moving = self._add_distribution(axes) if self._is_distribution else []
+        name = f"its {episode.metric}" if self._is_distribution else "critic's value"
+        style = {"color": COLORS["black"], "linestyle": (0, (2, 1))}
+        self._value = axes.axvline(linewidth=1.6, label=name, **style)
+        style = {"color": COLORS["vermilion"], "label": "return that followed"}
+        self._discounted = axes.axvline(linewidth=1.6, **style)
         self._numbers = self._figure.text(0.98, 0.97, "", size=size + 1, va="top", ha="right")
-        self._moving: list[Any] = []
-        if episode.quantiles.shape[-1] > 1:
-            self._add_distribution(episode)
-        name = f"its {episode.config.metric}" if self._moving else "critic's value"
-        self._value = self._add_line(name, COLORS["black"], DASHED)
-        self._discounted = self._add_line("return that followed", COLORS["vermilion"], "-")
-        self._figure.legend(
-            loc="upper left",
-            bbox_to_anchor=(0.01, 0.86),
-            ncols=3,
-            frameon=False,
-            fontsize=size,
-            borderpad=0.1,
-            handlelength=1.5,
-            columnspacing=1.2,
-        )
-        self._moving += [self._value, self._discounted, self._numbers]
+        place: Any = {"loc": "upper left", "bbox_to_anchor": (0.01, 0.86), "columnspacing": 1.2}
+        self._figure.legend(ncols=3, frameon=False, fontsize=size, handlelength=1.5, **place)
+        self._moving = [*moving, self._value, self._discounted, self._numbers]
         for artist in self._moving:
             artist.set_animated(True)
         self._canvas.draw()
@@ -87,7 +70,7 @@ class Overlay:
     def render(self, t: int) -> UInt8[np.ndarray, "h W 3"]:
         """Draw the overlay at the t-th state."""
         episode = self._episode
-        if episode.quantiles.shape[-1] > 1:
+        if self._is_distribution:
             z = episode.quantiles[t]
             self._density.set_data(self._x, 0, density(z, self._x) / self._highest)
             self._rug.set_segments(
@@ -95,32 +78,25 @@ class Overlay:
             )
         self._value.set_xdata([episode.value[t]] * 2)
         self._discounted.set_xdata([episode.discounted[t]] * 2)
-        end = "   fell" if episode.fell and t == len(episode.total) - 1 else ""
-        self._numbers.set_text(f"{t * episode.dt:.2f} s   return {episode.total[t]:,.0f}{end}")
+        self._numbers.set_text(f"{t * episode.dt:.2f} s   return {episode.total[t]:,.0f}")
         self._canvas.restore_region(self._background)
         for artist in self._moving:
             self._figure.draw_artist(artist)
         return np.asarray(self._canvas.buffer_rgba())[..., :3].copy()
 
-    def _add_line(self, label: str, color: str, style: Any) -> Line2D:
-        line = Line2D([0, 0], [-RUG, 1.1], color=color, linestyle=style, linewidth=1.6, label=label)
-        return self._axes.add_line(line)
-
-    def _add_distribution(self, episode: Episode) -> None:
+    def _add_distribution(self, axes: Any) -> list[Any]:
         """Add density and rug; each line of the rug is as long as its quantile's weight."""
-        count = episode.quantiles.shape[-1]
-        weights = weights_of(episode.config.metric, count)
-        self._weights = np.ones(count) if weights is None else weights / weights.max()
-        low, high = self._axes.get_xlim()
-        self._x = np.linspace(low, high, POINTS)
-        peaks = [density(z, self._x).max() for z in episode.quantiles[::10]]
+        quantiles = self._episode.quantiles
+        weights = weights_of(self._episode.metric, quantiles.shape[-1])
+        self._weights = np.ones_like(quantiles[0]) if weights is None else weights / weights.max()
+        low, high = axes.get_xlim()
+        self._x = np.linspace(low, high, 200)
+        peaks = [density(z, self._x).max() for z in quantiles[::10]]
         self._highest = np.quantile(peaks, 0.9)
-        self._density = self._axes.fill_between(
-            self._x, 0, 0, color=COLORS["sky"], alpha=0.6, lw=0, label="critic's distribution"
-        )
-        self._rug = LineCollection([], colors=COLORS["blue"], linewidths=0.7)
-        self._axes.add_collection(self._rug, autolim=False)
-        self._moving += [self._density, self._rug]
+        style = {"color": COLORS["sky"], "alpha": 0.6, "lw": 0, "label": "critic's distribution"}
+        self._density = axes.fill_between(self._x, 0, 0, **style)
+        self._rug = axes.vlines([], 0, 0, colors=COLORS["blue"], linewidths=0.7)
+        return [self._density, self._rug]
 
 
 def density(
@@ -135,17 +111,13 @@ def density(
     return kernels.mean(-1) / (bandwidth * np.sqrt(2 * np.pi))
 
 
-def _limits(episode: Episode) -> tuple[float, float]:
-    """Return the range of returns to draw, without the most extreme quantiles."""
+def _axes(figure: Figure, size: float, episode: Episode) -> Any:
+    """Add axes for all returns but the most extreme quantiles."""
     low, high = np.quantile(episode.quantiles, [0.002, 0.998])
     low, high = min(low, episode.discounted.min()), max(high, episode.discounted.max())
     margin = 0.04 * (high - low) + 1e-3
-    return low - margin, high + margin
-
-
-def _axes(figure: Figure, size: float, limits: tuple[float, float]) -> Any:
     axes = figure.add_axes((0.03, 0.3, 0.94, 0.36))
-    axes.set(xlim=limits, ylim=(-RUG, 1.15), yticks=[])
+    axes.set(xlim=(low - margin, high + margin), ylim=(-RUG, 1.15), yticks=[])
     axes.axhline(0, color="0.4", linewidth=0.6)
     axes.spines[["left", "top", "right"]].set_visible(False)
     axes.tick_params(labelsize=size - 0.5, length=2, pad=1.5)

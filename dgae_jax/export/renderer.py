@@ -24,49 +24,26 @@ GROUND = ((0.86, 0.89, 0.90), (0.74, 0.79, 0.82))
 LAMP, AMBIENT, HEADLIGHT = (0.4, 0.4, 0.4), (0.45, 0.45, 0.45), (0.3, 0.3, 0.3)
 """Together about 1, so that the ground keeps its colors."""
 
-LAMP_HEIGHT = 4.0
-"""Above the robot [m]."""
 
-SHADOW_SIZE = 2048
-"""Resolution of shadows [pixels]; on a CPU finer ones take most of the time."""
+class Renderer(mujoco.Renderer):
+    """MuJoCo's renderer of one task, with a camera and a lamp that follow the robot."""
 
-
-class Renderer:
-    """Draw one task; close it, or use it as a context manager."""
-
-    def __init__(self, env: str, version: str | None, *, width: int, height: int):
+    def __init__(self, env: str, version: str | None, width: int, height: int):
         """Open an OpenGL context for pictures of this size in pixels."""
+        super().__init__(_model(env, version, width, height), height, width)
         self._camera = camera = mujoco.MjvCamera()
-        camera.distance, camera.elevation, camera.azimuth, self._height = CAMERAS[env]
-        self.model = _model(env, version, width, height)
+        camera.distance, camera.elevation, camera.azimuth, self._look_at = CAMERAS[env]
         self._data = mujoco.MjData(self.model)
-        self._renderer = mujoco.Renderer(self.model, height, width)
 
-    def __enter__(self) -> "Renderer":
-        return self
-
-    def __exit__(self, *_) -> None:
-        self.close()
-
-    def close(self) -> None:
-        """Free the OpenGL context."""
-        self._renderer.close()
-
-    def render(
-        self, qpos: Float[np.ndarray, " Q"], qvel: Float[np.ndarray, " V"] | None = None
-    ) -> UInt8[np.ndarray, "H W 3"]:
-        """Draw the robot at these positions (m, rad) and velocities, by default at rest.
-
-        The camera follows its center of mass in x and y.
-        """
+    def draw(self, qpos: Float[np.ndarray, " Q"]) -> UInt8[np.ndarray, "H W 3"]:
+        """Draw the robot at these positions (m, rad)."""
         self._data.qpos[:] = qpos
-        self._data.qvel[:] = 0 if qvel is None else qvel
         mujoco.mj_forward(self.model, self._data)
         x, y, _ = self._data.body("torso").subtree_com
-        self._camera.lookat[:] = x, y, self._height
-        self._data.light_xpos[:] = x, y, LAMP_HEIGHT  # a lamp that stays behind casts no shadow
-        self._renderer.update_scene(self._data, self._camera)
-        return self._renderer.render().copy()
+        self._camera.lookat[:] = x, y, self._look_at
+        self._data.light_xpos[:] = x, y, 4  # a lamp that stays behind casts no shadow
+        self.update_scene(self._data, self._camera)
+        return self.render().copy()
 
 
 def _model(env: str, version: str | None, width: int, height: int) -> mujoco.MjModel:
@@ -87,5 +64,5 @@ def _model(env: str, version: str | None, width: int, height: int) -> mujoco.MjM
     model.vis.headlight.ambient, model.vis.headlight.diffuse = AMBIENT, HEADLIGHT
     model.vis.headlight.specular = (0, 0, 0)
     model.vis.global_.offwidth, model.vis.global_.offheight = width, height
-    model.vis.quality.shadowsize = SHADOW_SIZE
+    model.vis.quality.shadowsize = 2048  # on a CPU finer shadows take most of the time
     return model

@@ -20,18 +20,16 @@ class Sb3VecEnv(VecEnv):
         """Wrap a vector env with `autoreset_mode` SameStep, as stable-baselines3 expects."""
         mode = env.metadata.get("autoreset_mode")
         if mode is not AutoresetMode.SAME_STEP:
-            expected = AutoresetMode.SAME_STEP.value
-            raise invalid("autoreset_mode", getattr(mode, "value", mode), expected)
+            raise invalid("autoreset_mode", getattr(mode, "value", mode), "SameStep")
         self.env = env
         super().__init__(env.num_envs, env.single_observation_space, env.single_action_space)
 
     def reset(self) -> np.ndarray:
         """Begin an episode in every env, with the seeds of `seed` if it was called."""
         seeds: Any = self._seeds
-        options = self._options[0]
+        obs, infos = self.env.reset(seed=seeds, options=self._options[0])
         self._reset_seeds()
         self._reset_options()
-        obs, infos = self.env.reset(seed=seeds, options=options)
         self.reset_infos = _per_env(infos, self.num_envs)
         return obs
 
@@ -63,19 +61,15 @@ class Sb3VecEnv(VecEnv):
         """Return an attribute, which all envs share, once for each of `indices`."""
         return [getattr(self.env, attr_name) for _ in self._get_indices(indices)]
 
-    def set_attr(self, attr_name: str, value: Any, indices=None) -> None:
-        """Raise NotImplementedError: envs share all attributes."""
-        raise NotImplementedError(f"{attr_name}: set it on the vector env, which all envs share")
-
-    def env_method(
-        self, method_name: str, *method_args, indices=None, **method_kwargs
-    ) -> list[Any]:
-        """Raise NotImplementedError: an env is no object of its own."""
-        raise NotImplementedError(f"{method_name}: call it on the vector env, which all envs share")
-
     def env_is_wrapped(self, wrapper_class: type, indices=None) -> list[bool]:
         """Return False for each env: wrappers go around all of them."""
         return [False for _ in self._get_indices(indices)]
+
+    def env_method(self, method_name: str, *_, **__) -> list[Any]:
+        """Raise NotImplementedError: no env is an object of its own."""
+        raise NotImplementedError(f"{method_name}: use `env`, whose attributes all envs share")
+
+    set_attr = env_method
 
 
 def _per_env(infos: dict[str, Any], count: int) -> list[dict[str, Any]]:

@@ -1,8 +1,7 @@
 """Videos of trained policies: robots side by side, each over an overlay of its critic."""
 
 import math
-from collections.abc import Iterable, Iterator
-from contextlib import ExitStack
+from collections.abc import Iterable, Iterator, Sequence
 from itertools import islice, zip_longest
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -20,17 +19,8 @@ from dgae_jax.maths.risk import weights_of
 from dgae_jax.run import checkpoint
 from dgae_jax.run.api import Policy
 from dgae_jax.run.calibration import MAX_RETURN_STEPS, steps_that_count
-from dgae_jax.run.episodes import episode_seeds, gymnasium_steps, make_eval_env
+from dgae_jax.run.episodes import gymnasium_steps, make_eval_env
 from dgae_jax.run.runtime import Watch, unwatched
-
-HOLD = 0.6
-"""Seconds for which the last frame of an episode stands."""
-
-PER_ROW = 3
-"""Most robots in one row; more are arranged in a square."""
-
-REPORT_EVERY = 25
-"""Frames between reports of progress."""
 
 Frame = UInt8[np.ndarray, "H W 3"]
 
@@ -45,52 +35,32 @@ class Actor(NamedTuple):
     """Divisor of the critic's rewards."""
 
 
-class Clip(NamedTuple):
-    """The part of a policy's episodes that a video shows."""
-
-    episodes: int
-    seed: int
-    """Of the initial states, as in an evaluation."""
-    seconds: float
-    """Longest part of an episode, in simulated time [s]."""
-
-
-def of_runs(
-    runs: list[tuple[str, Path, ResolvedConfig]], which: str, index: int, clip: Clip
-) -> Iterator[list[Episode]]:
-    """Play each initial state with the policies of all runs.
+def actors(
+    runs: Sequence[tuple[str, Path, ResolvedConfig]], which: str, index: int
+) -> Iterator[list[Actor]]:
+    """Yield policies that play the same initial states, side by side.
 
     Args:
-        runs: title, source and configuration of each.
-        which: the checkpoint, latest or best.
+        runs: title, source and configuration of each run.
+        which: the checkpoint, latest or best; or all that the first run keeps, one after the other.
         index: which of the seeds that were trained together, from 0.
-        clip: what is played.
     """
-    actors = [
-        _actor(title, checkpoint.load_networks(path, config, which), config, index)
-        for title, path, config in runs
-    ]
-    yield from _play_all(actors, clip)
 
+    def actor(title: str, found: checkpoint.Networks, config: ResolvedConfig) -> Actor:
+        policy, critic = jax.tree.map(lambda x: x[index], (found.policy, found.critic))
+        std = checkpoint.reward_std(found.path, config)[index]
+        return Actor(title, Policy(policy, critic, config), config, float(std))
 
-def of_checkpoints(
-    path: Path, config: ResolvedConfig, index: int, clip: Clip
-) -> Iterator[list[Episode]]:
-    """Play the policy at each checkpoint that the run keeps, oldest first; see `of_runs`."""
-    for found in checkpoint.load_all_networks(path, config):
-        samples = int(found.path.stem.removeprefix("steps_"))
-        yield from _play_all([_actor(f"after {samples:,} samples", found, config, index)], clip)
-
-
-def _actor(title: str, found: checkpoint.Networks, config: ResolvedConfig, index: int) -> Actor:
-    policy, critic = jax.tree.map(lambda x: x[index], (found.policy, found.critic))
-    std = checkpoint.reward_std(found.path, config)[index]
-    return Actor(title, Policy(policy, critic, config), config, float(std))
-
-
-def _play_all(actors: list[Actor], clip: Clip) -> Iterator[list[Episode]]:
-    for seed in episode_seeds(clip.seed, clip.episodes):
-        yield [play(actor, int(seed), clip.seconds) for actor in actors]
+    if which == "all":
+        _, path, config = runs[0]
+        for found in checkpoint.load_all_networks(path, config):
+            samples = int(found.path.stem.removeprefix("steps_"))
+            yield [actor(f"after {samples:,} samples", found, config)]
+    else:
+        yield [
+            actor(title, checkpoint.load_networks(path, config, which), config)
+            for title, path, config in runs
+        ]
 
 
 def play(actor: Actor, seed: int, seconds: float) -> Episode:
@@ -106,59 +76,57 @@ def play(actor: Actor, seed: int, seconds: float) -> Episode:
     most = shown + steps_that_count(config.gamma)
     steps = list(islice(gymnasium_steps([env], actor.policy, [seed], _pose), most))
     env.close()
-    qpos, qvel = map(np.stack, zip(*(step.snapshots[0] for step in steps[:shown]), strict=True))
     rewards = np.concatenate([step.reward for step in steps])
     followed = lambda_sum(jnp.asarray(rewards), jnp.full(len(rewards), config.gamma))
     obs = np.concatenate([step.obs for step in steps[:shown]])
     quantiles = np.sort(actor.policy.quantiles(obs.astype(np.float32)))
     return Episode(
         actor.title,
-        config,
+        config.metric,
         dt,
-        fell=len(steps) <= shown and bool(steps[-1].terminated[0]),
-        qpos=qpos,
-        qvel=qvel,
-        total=np.cumsum([0.0, *rewards])[: len(qpos)],
+        qpos=np.stack([step.snapshots[0] for step in steps[:shown]]),
+        total=np.cumsum([0.0, *rewards])[: len(obs)],
         quantiles=quantiles,
         value=np.average(quantiles, -1, weights_of(config.metric, quantiles.shape[-1])),
-        discounted=np.asarray(followed)[: len(qpos)] / actor.reward_std,
+        discounted=np.asarray(followed)[: len(obs)] / actor.reward_std,
     )
 
 
-def _pose(env: Any) -> tuple[np.ndarray, np.ndarray]:
-    data = env.unwrapped.data
-    return data.qpos.copy(), data.qvel.copy()
+def _pose(env: Any) -> np.ndarray:
+    return env.unwrapped.data.qpos.copy()
 
 
 def frames(
-    scenes: Iterable[list[Episode]], width: int, height: int, fps: float, watch: Watch = unwatched
+    casts: Iterable[list[Actor]],
+    seeds: Sequence[int] | np.ndarray,
+    seconds: float,
+    size: tuple[int, int],
+    fps: float,
+    watch: Watch = unwatched,
 ) -> Iterator[Frame]:
-    """Draw scenes one after the other, the episodes of each side by side, in simulated time.
+    """Draw each cast in each initial state, one after the other, in simulated time.
 
     Args:
-        scenes: from `of_runs` or `of_checkpoints`.
-        width: of each robot's picture [pixels].
-        height: without its overlay [pixels].
+        casts: from `actors`.
+        seeds: of the initial states, as `episode_seeds` returns them.
+        seconds: longest part of an episode, in simulated time [s].
+        size: width and height of each robot's picture, without its overlay [pixels].
         fps: frames per second.
         watch: told how far it is.
     """
-    with ExitStack() as stack:
-        renderers: dict[tuple, Renderer] = {}
-        count = 0
-        for number, scene in enumerate(scenes, 1):
-            columns = []
-            for episode in scene:
-                task = episode.config.env, episode.config.env_version
-                if task not in renderers:
-                    renderers[task] = stack.enter_context(
-                        Renderer(*task, width=width, height=height)
-                    )
-                columns.append(_panels(episode, renderers[task], width, fps))
-            for frame in side_by_side(columns, hold=round(HOLD * fps)):
-                if count % REPORT_EVERY == 0:
-                    watch(f"drawing episode {number}, frame {count:,}")
-                count += 1
-                yield frame
+    for cast in casts:
+        for number, seed in enumerate(seeds, 1):
+            watch(f"drawing episode {number} of {', '.join(actor.title for actor in cast)}")
+            columns = [_panels(actor, play(actor, int(seed), seconds), size, fps) for actor in cast]
+            yield from side_by_side(columns, hold=round(0.6 * fps))
+
+
+def _panels(actor: Actor, episode: Episode, size: tuple[int, int], fps: float) -> Iterator[Frame]:
+    """Draw one episode, the robot above its overlay."""
+    config, overlay = actor.config, Overlay(episode, size[0])
+    with Renderer(config.env, config.env_version, *size) as renderer:
+        for t in states_shown(len(episode.qpos), episode.dt, fps):
+            yield np.concatenate([renderer.draw(episode.qpos[t]), overlay.render(t)])
 
 
 def states_shown(states: int, dt: float, fps: float) -> list[int]:
@@ -178,15 +146,8 @@ def side_by_side(columns: list[Iterator[Frame]], hold: int) -> Iterator[Frame]:
 
 
 def tile(panels: list[Frame]) -> Frame:
-    """Arrange panels in rows; the rest of the last row is white."""
-    columns = len(panels) if len(panels) <= PER_ROW else math.ceil(math.sqrt(len(panels)))
+    """Arrange panels in one row, in a square from four on; its rest is white."""
+    columns = len(panels) if len(panels) < 4 else math.ceil(math.sqrt(len(panels)))
     panels = [*panels, *[np.full_like(panels[0], 255)] * (-len(panels) % columns)]
     rows = [np.concatenate(panels[i : i + columns], axis=1) for i in range(0, len(panels), columns)]
     return np.concatenate(rows)
-
-
-def _panels(episode: Episode, renderer: Renderer, width: int, fps: float) -> Iterator[Frame]:
-    overlay = Overlay(episode, width)
-    for t in states_shown(len(episode.qpos), episode.dt, fps):
-        robot = renderer.render(episode.qpos[t], episode.qvel[t])
-        yield np.concatenate([robot, overlay.render(t)])

@@ -106,15 +106,12 @@ def improvements(groups: Iterable[Group]) -> list[Improvement]:
             for other in members
             if (one.algo, other.algo, other.number) == (better, worse, 0)
         ]
-        out += [_improvement(one.task, [(one, other)]) for one, other in duels]
         first = [(one, other) for one, other in duels if one.number == 0]
-        out += [_improvement(ALL, first)] if len(first) > 1 else []
+        named = [(one.task, [(one, other)]) for one, other in duels]
+        for task, both in [*named, (ALL, first)] if len(first) > 1 else named:
+            ours, theirs = ([group.finals for group in side] for side in zip(*both, strict=True))
+            out.append(Improvement(task, *both[0], improvement(ours, theirs)))
     return out
-
-
-def _improvement(task: str, duels: Sequence[tuple[Group, Group]]) -> Improvement:
-    better, worse = [one.finals for one, _ in duels], [other.finals for _, other in duels]
-    return Improvement(task, *duels[0], improvement(better, worse))
 
 
 def normalised(groups: Iterable[Group]) -> dict[str, tuple[Group, list[np.ndarray]]]:
@@ -130,19 +127,17 @@ def normalised(groups: Iterable[Group]) -> dict[str, tuple[Group, list[np.ndarra
     return out
 
 
-def best_mean(groups: Iterable[Group]) -> float | None:
-    """Return the highest training return of the groups, averaged over seeds; None without one."""
-    curves = [group.curve[1] for group in groups]
-    return max((float(curve.mean(0).max()) for curve in curves if curve.size), default=None)
+def reached(groups: Sequence[Group]) -> tuple[float | None, list[list[int | None]]]:
+    """Return a task's highest mean training return, and the samples to each share `REACH` of it.
 
-
-def reached(group: Group, best: float | None) -> list[int | None]:
-    """Return the samples after which the mean over seeds reaches each share `REACH` of `best`.
-
-    None for a share that is not reached, and for all if `best` is not positive.
+    Means are over seeds. None for a share that a group does not reach, and without returns.
     """
-    steps, curve = group.curve
-    if best is None or best <= 0 or not curve.size:
-        return [None] * len(REACH)
-    above = [steps[curve.mean(0) >= share * best] for share in REACH]
-    return [int(found[0]) if len(found) else None for found in above]
+    curves = [group.curve for group in groups]
+    means = [curve.mean(0) if curve.size else np.empty(0) for _, curve in curves]
+    best = max((float(mean.max()) for mean in means if mean.size), default=None)
+    shares = [share * best if best and best > 0 else np.inf for share in REACH]
+    found = []
+    for (steps, _), mean in zip(curves, means, strict=True):
+        above = [steps[mean >= share] for share in shares]
+        found.append([int(some[0]) if len(some) else None for some in above])
+    return best, found

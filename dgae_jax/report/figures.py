@@ -4,7 +4,7 @@ import io
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import matplotlib as mpl
 import numpy as np
@@ -18,7 +18,6 @@ from dgae_jax.report import analysis
 from dgae_jax.report.analysis import Estimate, Improvement
 from dgae_jax.report.groups import Group, by_task
 from dgae_jax.report.results import Published
-from dgae_jax.run import files
 
 PANEL = (4.5, 3.3)
 """Size of a panel [inches]: its text is legible on a phone, where a panel fills the width."""
@@ -34,30 +33,20 @@ MARKERS = ("", "o", "s", "^", "D", "v", "P", "X")
 STYLE = Path(__file__).parent / "templates" / "figures.mplstyle"
 
 
-class Look(NamedTuple):
-    """Style of a line, and of its dot."""
+def look(algo: str, number: int = 0) -> dict[str, Any]:
+    """Return Matplotlib's properties of a group's line, by its algorithm and its number.
 
-    colour: str
-    line: str
-    marker: str
-    fill: str
-    """Inside of the dot: white for a scalar critic."""
-
-
-def look(algo: str, number: int = 0) -> Look:
-    """Return the look of a group by its algorithm and its number.
-
-    The colour is that of the policy update; a line is dashed for a scalar critic.
+    The colour is that of the policy update. A scalar critic has dashes and hollow markers.
     """
 
     def kind(name: str) -> tuple[str, bool]:
         return ALGORITHMS[name].policy_update, "quantiles" in CRITICS[ALGORITHMS[name].critic]
 
     update, distribution = kind(algo)
-    colour = COLOURS.get(update, CUSTOM)
     alike = [name for name in ALGORITHMS if kind(name) == (update, distribution)]
-    marker = MARKERS[(number + alike.index(algo)) % len(MARKERS)]
-    return Look(colour, *(("-", marker, colour) if distribution else ("--", marker, "white")))
+    style = {"color": COLOURS.get(update, CUSTOM), "linestyle": "-" if distribution else "--"}
+    style["marker"] = MARKERS[(number + alike.index(algo)) % len(MARKERS)]
+    return style | {"markerfacecolor": style["color"] if distribution else "white"}
 
 
 def learning_curves(groups: Iterable[Group], published: Sequence[Published] = ()) -> Figure:
@@ -75,7 +64,6 @@ def learning_curves(groups: Iterable[Group], published: Sequence[Published] = ()
         _crosses(axes, members, published)
         axes.set(xlabel="environment steps", ylabel="episode return")
         axes.xaxis.set_major_formatter(EngFormatter(sep=""))
-        axes.margins(x=0.02)
 
     return _panels(by_task(groups), draw, PANEL[1], legend=True)
 
@@ -83,11 +71,10 @@ def learning_curves(groups: Iterable[Group], published: Sequence[Published] = ()
 def _line(
     axes: Axes, group: Group, x: np.ndarray, y: np.ndarray, ends: Any, markevery: float
 ) -> None:
-    colour, line, marker, _ = look(group.algo, group.number)
-    style = {"color": colour, "marker": marker, "markevery": markevery, "markersize": 4}
-    axes.plot(x, y, line, label=group.name, **style)
+    style = look(group.algo, group.number)
+    axes.plot(x, y, label=group.name, markevery=markevery, markersize=4, **style)
     if ends is not None:
-        axes.fill_between(x, *ends, color=colour, alpha=0.12, linewidth=0)
+        axes.fill_between(x, *ends, color=style["color"], alpha=0.12, linewidth=0)
 
 
 def _crosses(axes: Axes, members: Sequence[Group], published: Sequence[Published]) -> None:
@@ -96,7 +83,7 @@ def _crosses(axes: Axes, members: Sequence[Group], published: Sequence[Published
     known = [one for one in published if one.task == env and one.samples <= end]
     for number, one in enumerate(known, start=1):
         algo = one.algorithm.lower()
-        colour = look(algo).colour if algo in ALGORITHMS else PUBLISHED
+        colour = look(algo)["color"] if algo in ALGORITHMS else PUBLISHED
         at = one.samples + number * 0.015 * end  # a little to the right, beside each other
         style = {"fmt": "x", "markersize": 5, "capsize": 2, "linewidth": 1, "color": colour}
         axes.errorbar(at, one.mean, one.spread, label=f"{one.algorithm}, published", **style)
@@ -110,7 +97,7 @@ def final_returns(groups: Iterable[Group]) -> Figure:
         _dots(axes, members, [analysis.interquartile_mean(scores) for scores in finals], finals)
         axes.set_xlabel("return of the final policy")
 
-    return _dot_panels(groups, draw)
+    return _dot_panels(by_task(groups), draw)
 
 
 def speed(groups: Iterable[Group]) -> Figure:
@@ -123,7 +110,7 @@ def speed(groups: Iterable[Group]) -> Figure:
         axes.set_xlim(0, 1.1 * max(rate.max() for rate in rates))
         axes.xaxis.set_major_formatter(EngFormatter(sep=""))
 
-    return _dot_panels(groups, draw)
+    return _dot_panels(by_task(groups), draw)
 
 
 def improvement(found: Sequence[Improvement]) -> Figure:
@@ -131,13 +118,14 @@ def improvement(found: Sequence[Improvement]) -> Figure:
 
     def draw(axes: Axes, duels: Sequence[Improvement]) -> None:
         names = [f"{duel.better.name} > {duel.worse.name}\n{duel.task}" for duel in duels]
-        _dots(axes, [duel.better for duel in duels], [duel.estimate for duel in duels])
+        none, estimates = [np.empty(0)] * len(duels), [duel.estimate for duel in duels]
+        _dots(axes, [duel.better for duel in duels], estimates, none)
         axes.set_yticks(range(len(duels)), names)
         axes.axvline(0.5, color=FAINT, linewidth=1)
         axes.set(xlabel="probability of improvement", xlim=(-0.03, 1.03))
         axes.xaxis.set_major_formatter(PercentFormatter(1))
 
-    return _panels({"Distributional against scalar": found}, draw, _height(len(found), 0.4))
+    return _dot_panels({"Distributional against scalar": found}, draw, each=0.4)
 
 
 def performance_profile(groups: Iterable[Group]) -> Figure:
@@ -177,7 +165,7 @@ def pit_histograms(found: Mapping[str, tuple[str, dict[str, Any]]]) -> Figure:
     def draw(axes: Axes, critic: tuple[str, dict[str, Any]]) -> None:
         algo, shares = critic[0], np.array(critic[1]["pit"])
         edges = np.linspace(0, 1, len(shares) + 1)
-        style = {"color": look(algo).colour, "edgecolor": "white", "linewidth": 0.5}
+        style = {"color": look(algo)["color"], "edgecolor": "white", "linewidth": 0.5}
         axes.bar(edges[:-1], shares, np.diff(edges), align="edge", **style)
         axes.axhline(1 / len(shares), color=FAINT, linestyle=":", label="calibrated")
         axes.set(xlabel="share of the quantiles below the observed return", ylabel="returns")
@@ -188,35 +176,26 @@ def pit_histograms(found: Mapping[str, tuple[str, dict[str, Any]]]) -> Figure:
 
 
 def _dots(
-    axes: Axes,
-    groups: Sequence[Group],
-    estimates: Sequence[Estimate],
-    seeds: Sequence[np.ndarray] | None = None,
+    axes: Axes, groups: Sequence[Group], estimates: Sequence[Estimate], seeds: Sequence[np.ndarray]
 ) -> None:
     """Draw rows from top to bottom: ticks of the seeds, the interval, the value."""
-    seeds = seeds or [np.empty(0)] * len(groups)
     for y, (group, estimate, dots) in enumerate(zip(groups, estimates, seeds, strict=True)):
-        colour, _, marker, fill = look(group.algo, group.number)
-        faint = {"color": colour, "alpha": 0.6}
+        style = look(group.algo, group.number)
+        faint = {"color": style["color"], "alpha": 0.6}
         axes.plot(dots, np.full(len(dots), y), "|", markersize=7, **faint)
         if estimate.interval is not None:
-            style = {"linewidth": 2.2, "solid_capstyle": "butt", **faint}
-            axes.plot(estimate.interval, [y, y], "-", **style)
-        style = {"color": colour, "markerfacecolor": fill, "markersize": 6, "zorder": 3}
-        axes.plot(estimate.value, y, marker or "o", **style)
+            axes.plot(estimate.interval, [y, y], linewidth=2.2, **faint)
+        style["marker"] = style["marker"] or "o"
+        axes.plot(estimate.value, y, markersize=6, **style)
     axes.set_yticks(range(len(groups)), [group.name for group in groups])
     axes.set_ylim(len(groups) - 0.5, -0.5)
     axes.grid(axis="y", visible=False)
-    axes.tick_params(axis="y", length=0)
 
 
-def _height(rows: int, each: float = 0.28) -> float:
-    return 0.9 + each * rows
-
-
-def _dot_panels(groups: Iterable[Group], draw: Callable[[Axes, Sequence[Group]], None]) -> Figure:
-    tasks = by_task(groups)
-    return _panels(tasks, draw, _height(max(map(len, tasks.values()))))
+def _dot_panels(
+    contents: Mapping[str, Sequence[Any]], draw: Callable[[Axes, Any], None], each: float = 0.28
+) -> Figure:
+    return _panels(contents, draw, 0.9 + each * max(map(len, contents.values())))
 
 
 def _panels(
@@ -234,7 +213,6 @@ def _panels(
     with mpl.rc_context(fname=STYLE):
         size = columns * PANEL[0], rows * height + 0.5 * legend
         figure = Figure(figsize=size, layout="constrained", dpi=150)
-        figure.set_layout_engine("constrained", h_pad=0.1)
         panels = list(figure.subplots(rows, columns, squeeze=False, sharey=sharey).flat)
         for axes, (title, content) in zip(panels, contents.items(), strict=False):
             draw(axes, content)
@@ -247,42 +225,18 @@ def _panels(
 
 
 def _legend(figure: Figure) -> None:
-    """Draw each label once below the panels, colour by colour, so that pairs share a column."""
-    handles: dict[str, tuple[str, Any]] = {}
+    """Draw each label once below the panels; the two of a pair share a column."""
+    handles: dict[str, Any] = {}
     for axes in figure.axes:
-        for handle, label in zip(*axes.get_legend_handles_labels(), strict=True):
-            line = handle[0] if isinstance(handle, tuple) else handle  # cross of an error bar
-            handles.setdefault(label, (line.get_color(), handle))
-    colours = list(dict.fromkeys(colour for colour, _ in handles.values()))
-    ordered = sorted(handles.items(), key=lambda item: colours.index(item[1][0]))
-    if ordered:
-        figure.legend(
-            [handle for _, (_, handle) in ordered],
-            [label for label, _ in ordered],
-            loc="outside lower center",
-            ncols=min(3, len(ordered)),
-            fontsize=8,
-            handlelength=2.4,
-            columnspacing=1.2,
-        )
+        found, labels = axes.get_legend_handles_labels()
+        handles |= dict(zip(labels, found, strict=True))
+    place: Any = {"loc": "outside lower center", "ncols": min(3, len(handles) or 1)}
+    figure.legend(handles.values(), handles, fontsize=8, handlelength=2.4, **place)
 
 
-def svg(figure: Figure) -> bytes:
-    """Return the figure as SVG, the same bytes each time."""
-    return _encoded(figure, "svg", metadata={"Date": None, "Creator": None})
-
-
-def save(figure: Figure, path: Path) -> list[Path]:
-    """Write `path`.png and `path`.svg, each complete or not at all."""
-    data = {".png": _encoded(figure, "png"), ".svg": svg(figure)}
-    written = [path.with_name(path.name + ending) for ending in data]
-    for file, content in zip(written, data.values(), strict=True):
-        files.replace(file, content)
-    return written
-
-
-def _encoded(figure: Figure, kind: str, **options) -> bytes:
-    image = io.BytesIO()
+def image(figure: Figure, kind: str) -> bytes:
+    """Return the figure as png or svg, the same bytes each time."""
+    file = io.BytesIO()
     with mpl.rc_context(fname=STYLE):
-        figure.savefig(image, format=kind, **options)
-    return image.getvalue()
+        figure.savefig(file, format=kind, metadata={"Date": None, "Creator": None})
+    return file.getvalue()

@@ -9,13 +9,9 @@ from typing import Any
 import numpy as np
 
 from dgae_jax.configs.algorithms import ALGORITHMS
-from dgae_jax.configs.serial import flat
 from dgae_jax.envs.registry import TASKS
 from dgae_jax.maths.statistics import sample_cvar
 from dgae_jax.report.results import Row
-
-SEEDS = ("seed", "num_seeds")
-"""Settings that do not make another experiment."""
 
 
 @dataclass(frozen=True)
@@ -58,26 +54,18 @@ class Group:
 
         Seeds in which no episode ended are left out.
         """
-        known = [np.isfinite(row.curve_returns) for row in self.rows]
-        curves = [
-            dict(zip(row.curve_steps[finite], row.curve_returns[finite], strict=True))
-            for row, finite in zip(self.rows, known, strict=True)
-            if finite.any()
-        ]
+        rows = [zip(row.curve_steps, row.curve_returns, strict=True) for row in self.rows]
+        known = [{step: x for step, x in row if np.isfinite(x)} for row in rows]
+        curves = [curve for curve in known if curve]
         steps = sorted(set.intersection(*map(set, curves))) if curves else []
         return np.array(steps), np.array([[curve[step] for step in steps] for curve in curves])
-
-    @property
-    def settings(self) -> dict[str, Any]:
-        """Settings by dotted path, without seeds."""
-        return _settings(self.rows[0])
 
 
 def groups_of(rows: Iterable[Row]) -> list[Group]:
     """Group rows by task and algorithm, then by variant and settings in the order of the rows."""
     by_kind: dict[tuple[str, str], dict[tuple[str | None, str], list[Row]]] = {}
     for row in sorted(rows, key=order):
-        key = row.variant, json.dumps(_settings(row), sort_keys=True)
+        key = row.variant, json.dumps(row.settings, sort_keys=True)
         by_kind.setdefault((row.task, row.algo), {}).setdefault(key, []).append(row)
     groups = []
     for (task, algo), variants in by_kind.items():
@@ -107,14 +95,10 @@ def shown(value: Any) -> str:
     return "–" if value is None else str(value)
 
 
-def _settings(row: Row) -> dict[str, Any]:
-    return {name: value for name, value in flat(row.config).items() if name not in SEEDS}
-
-
 def _variant(first: Row, other: Row, number: int, most: int = 3) -> str:
     if other.variant or not number:
         return (other.variant or "").removesuffix("+noise")  # the task says so
-    ours, theirs = _settings(first), _settings(other)
+    ours, theirs = first.settings, other.settings
     differ = [name for name in {**ours, **theirs} if ours.get(name) != theirs.get(name)]
     named = ", ".join(f"{name} {shown(theirs.get(name))}" for name in differ[:most])
     return named + (f" and {len(differ) - most} more" if len(differ) > most else "")

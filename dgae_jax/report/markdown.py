@@ -32,28 +32,13 @@ _BLOCK = re.compile(
 )
 
 
-def check(path: Path, sweep: str) -> list[str]:
-    """Return the names of the tables in a document that a report on a sweep replaces.
-
-    Args:
-        path: The document.
-        sweep: Name of the sweep's directory.
-
-    Raises:
-        ConfigError: the file cannot be read, markers are missing or do not match, no table is of
-            the sweep, or only some tables name their sweep.
-    """
-    return [block["name"] for block in _blocks(path, _text(path), sweep)]
-
-
 def replace(path: Path, groups: Sequence[Group], sweep: str) -> list[str]:
     """Replace the tables of a document that are of a sweep, and return their names.
 
     Raises:
-        ConfigError: as `check`, or the file cannot be written.
+        ConfigError: as `find`, or the file cannot be written.
     """
-    text = _text(path)
-    blocks = _blocks(path, text, sweep)
+    text, blocks = find(path, sweep)
     for block in reversed(blocks):
         table = tables.markdown(TABLES[block["name"]](groups))
         text = f"{text[: block.start('table')]}{table}\n{text[block.end('table') :]}"
@@ -64,32 +49,31 @@ def replace(path: Path, groups: Sequence[Group], sweep: str) -> list[str]:
     return [block["name"] for block in blocks]
 
 
-def _blocks(path: Path, text: str, sweep: str) -> list[re.Match[str]]:
+def find(path: Path, sweep: str) -> tuple[str, list[re.Match[str]]]:
+    """Return the text of a document, and the tables in it that a report on a sweep replaces.
+
+    Raises:
+        ConfigError: the file cannot be read, markers are missing or do not match, no table is of
+            the sweep, or only some tables name their sweep.
+    """
+    try:
+        text = path.read_bytes().decode()
+    except (OSError, UnicodeDecodeError) as reason:
+        why = getattr(reason, "strerror", None) or "not text in UTF-8"
+        raise _refused(path, f"that can be read ({why})") from reason
     blocks = list(_BLOCK.finditer(text))
-    if not blocks or len(_MARKER.findall(text)) != 2 * len(blocks):
-        raise _refused(
-            path,
-            "with each table between <!-- dgae report: NAME --> and <!-- /dgae report --> on lines "
-            "of their own",
-        )
-    for block in blocks:
-        if block["name"] not in TABLES:
-            raise _refused(path, f"with tables named {', '.join(TABLES)}, not {block['name']}")
+    is_known = all(block["name"] in TABLES for block in blocks)
+    if not blocks or not is_known or len(_MARKER.findall(text)) != 2 * len(blocks):
+        markers = "<!-- dgae report: NAME --> and <!-- /dgae report -->"
+        names = ", ".join(TABLES)
+        raise _refused(path, f"with tables between lines {markers}; NAME is one of {names}")
     sweeps = dict.fromkeys(block["sweep"] for block in blocks)
     if None in sweeps and len(sweeps) > 1:
         raise _refused(path, "with NAME of SWEEP for all tables, or for none")
     mine = [block for block in blocks if block["sweep"] in (None, sweep)]
     if not mine:
         raise _refused(path, f"with a table of {sweep}; its tables are of {', '.join(sweeps)}")
-    return mine
-
-
-def _text(path: Path) -> str:
-    try:
-        return path.read_bytes().decode()
-    except (OSError, UnicodeDecodeError) as reason:
-        why = getattr(reason, "strerror", None) or "not text in UTF-8"
-        raise _refused(path, f"that can be read ({why})") from reason
+    return text, mine
 
 
 def _refused(path: Path, allowed: str) -> ConfigError:

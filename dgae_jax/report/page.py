@@ -19,15 +19,12 @@ from dgae_jax.run.terminal import counted
 
 
 def write(sweeps: Sequence[Sweep], out: Path, published: Sequence[Published] = ()) -> list[Path]:
-    """Write report.html and the figures of each sweep.
+    """Write report.html and the figures of each sweep, and return the files.
 
     Args:
         sweeps: The sweeps; several are compared with the first.
         out: Directory, made if needed. With several sweeps, figures are numbered by sweep.
         published: Published results to draw.
-
-    Returns:
-        The files in the order of writing.
 
     Raises:
         ConfigError: `out` cannot be written.
@@ -38,14 +35,15 @@ def write(sweeps: Sequence[Sweep], out: Path, published: Sequence[Published] = (
         for number, sweep in enumerate(sweeps, start=1):
             prefix = f"{number}-" if len(sweeps) > 1 else ""
             for name, figure in drawn(groups_of(sweep.rows), published):
-                written += figures.save(figure, out / (prefix + name))
+                for kind in ("png", "svg"):
+                    written.append(out / f"{prefix}{name}.{kind}")
+                    files.replace(written[-1], figures.image(figure, kind))
         gc.collect()  # figures are full of reference cycles
         html = out / "report.html"
         files.replace(html, page(sweeps, published).encode())
     except OSError as reason:
-        raise invalid(
-            "out", out, f"a directory that can be written ({reason.strerror})"
-        ) from reason
+        why = f"a directory that can be written ({reason.strerror})"
+        raise invalid("out", out, why) from reason
     return [*written, html]
 
 
@@ -85,13 +83,13 @@ def page(sweeps: Sequence[Sweep], published: Sequence[Published] = ()) -> str:
 
 
 def _videos(sweep: Sweep, groups: Iterable[Group]) -> dict[str, str]:
-    found = {}
-    for task, env in {group.task: group.rows[0].env for group in groups}.items():
-        names = (name.replace(":", "-") for name in (task, env))
-        paths = (sweep.directory / "videos" / f"{name}.mp4" for name in names)
-        if path := next((path for path in paths if path.is_file()), None):
-            found[task] = _data_uri("video/mp4", path.read_bytes())
-    return found
+    tasks, videos = by_task(groups), sweep.directory / "videos"
+    paths = {task: videos / f"{task.replace(':', '-')}.mp4" for task in tasks}
+    return {
+        task: _data_uri("video/mp4", path.read_bytes())
+        for task, path in paths.items()
+        if path.is_file()
+    }
 
 
 def _settings(groups: list[Group]) -> list[tuple[Group, Group, Table, set[str]]]:
@@ -100,7 +98,7 @@ def _settings(groups: list[Group]) -> list[tuple[Group, Group, Table, set[str]]]
     found = []
     for group in groups:
         first = firsts.setdefault(group.algo, group)
-        ours, theirs = group.settings, first.settings
+        ours, theirs = group.rows[0].settings, first.rows[0].settings
         differ = {name for name in ours if name not in theirs or theirs[name] != ours[name]}
         rows = [(name, shown(value)) for name, value in ours.items()]
         found.append((group, first, Table(("setting", "value"), rows, keys=1), differ))
@@ -124,7 +122,7 @@ def _versions(rows: Iterable[Row]) -> Table:
 
 def _svg_uri(figure: Figure) -> str:
     """Return a picture of its own, so that nothing in it meets the names of the page."""
-    return _data_uri("image/svg+xml", figures.svg(figure))
+    return _data_uri("image/svg+xml", figures.image(figure, "svg"))
 
 
 def _data_uri(kind: str, data: bytes) -> str:

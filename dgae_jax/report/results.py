@@ -1,18 +1,16 @@
 """Results of a sweep: one row per trained seed, read strictly from `results.jsonl`."""
 
+import contextlib
 import csv
-import json
-import math
 from dataclasses import dataclass, replace
 from pathlib import Path
-from types import NoneType
 from typing import Any, NamedTuple, get_args, get_type_hints
 
 import numpy as np
 
 from dgae_jax.configs.algorithms import ALGORITHMS
 from dgae_jax.configs.config import ConfigError
-from dgae_jax.configs.serial import upgraded
+from dgae_jax.configs.serial import flat, upgraded
 from dgae_jax.run import files, terminal
 
 RESULTS = "results.jsonl"
@@ -51,6 +49,12 @@ class Row:
     command: str
 
     @property
+    def settings(self) -> dict[str, Any]:
+        """The configuration by dotted path, without seeds."""
+        settings = flat(self.config)
+        return {name: x for name, x in settings.items() if name not in ("seed", "num_seeds")}
+
+    @property
     def task(self) -> str:
         """The env with its version, if it has one, and whether it is noisy."""
         noise = " with noise" if any((self.config.get("noise") or {}).values()) else ""
@@ -63,9 +67,9 @@ class Sweep:
 
     path: Path
     rows: tuple[Row, ...]
-    planned: tuple[str, ...] | None
-    """Names of the runs in study.json; None for a file of results."""
-    diverged: tuple[tuple[str, int], ...] = ()
+    missing: tuple[str, ...]
+    """Names of the runs in study.json that have no result."""
+    diverged: tuple[tuple[str, int], ...]
     """Runs and seeds that are left out, because their return is not finite."""
 
     @property
@@ -78,12 +82,6 @@ class Sweep:
         """Name of the directory."""
         return self.directory.resolve().name
 
-    @property
-    def missing(self) -> list[str]:
-        """Planned runs without a result."""
-        done = {row.run for row in self.rows} | {run for run, _ in self.diverged}
-        return [run for run in self.planned or () if run not in done]
-
 
 def read(path: Path) -> Sweep:
     """Read the results of a sweep.
@@ -95,55 +93,42 @@ def read(path: Path) -> Sweep:
     Raises:
         ConfigError: no sweep, no results yet, or a row that cannot be understood.
     """
+    plan, file = path / "study.json", path / RESULTS if path.is_dir() else path
     try:
-        if not path.exists():
-            raise ConfigError(f"{path}: must be the directory of a sweep; it does not exist")
-        file = path / RESULTS if path.is_dir() else path
-        if not file.exists() and not (path / "study.json").exists():
-            raise ConfigError(
-                f"{path}: must be the directory of a sweep, with study.json and {RESULTS}"
-            )
-        rows, diverged = _rows(file) if file.exists() else ((), ())
-        planned = _planned(path / "study.json") if path.is_dir() else None
+        if not file.exists() and not plan.exists():
+            why = f"must be the directory of a sweep, with study.json and {RESULTS}"
+            raise ConfigError(f"{path}: {why}")
+        found = _rows(file) if file.exists() else {}
+        planned = files.read_object(plan).get("cells") if plan.exists() else {}
     except OSError as reason:
-        raise ConfigError(
-            f"{path}: must be a sweep that can be read ({reason.strerror})"
-        ) from reason
+        why = f"must be a sweep that can be read ({reason.strerror})"
+        raise ConfigError(f"{path}: {why}") from reason
+    if planned is None:
+        raise ConfigError(f"{plan}: must be an object with the runs of the sweep")
+    rows = tuple(row for row in found.values() if row)
     if not rows:
         raise ConfigError(f"{path}: must have results; {RESULTS} has none yet")
-    return Sweep(path, rows, planned, diverged)
+    done = {run for run, _ in found}
+    diverged = tuple(key for key, row in found.items() if row is None)
+    return Sweep(path, rows, tuple(run for run in planned if run not in done), diverged)
 
 
-def _planned(path: Path) -> tuple[str, ...] | None:
-    if not path.exists():
-        return None
-    try:
-        return tuple(json.loads(path.read_bytes())["cells"].keys())
-    except (ValueError, RecursionError, KeyError, TypeError, AttributeError):
-        raise ConfigError(f"{path}: must be an object with the runs of the sweep") from None
-
-
-def _rows(path: Path) -> tuple[tuple[Row, ...], tuple[tuple[str, int], ...]]:
-    """Return the rows, and the runs and seeds that diverged."""
-    rows, diverged, end, number, seen = [], [], 0, 0, set()
+def _rows(path: Path) -> dict[tuple[str, int], Row | None]:
+    """Return the row of each run and seed; None if its return is not finite."""
+    rows, end, number = {}, 0, 0
     for number, (data, after) in enumerate(files.whole_rows(path), start=1):
         where, end = f"{path} line {number}", after
-        key = _field(data, "run", where), _field(data, "seed", where)
-        if key in seen:
-            raise ConfigError(f"{where}: run {key[0]}, seed {key[1]} is there twice")
-        seen.add(key)
+        key = run, seed = _field(data, "run", where), _field(data, "seed", where)
+        if key in rows:
+            raise ConfigError(f"{where}: run {run}, seed {seed} is there twice")
         final = data.get("final")
-        if isinstance(final, dict) and final.get("return_mean", 0) is None:  # null: not finite
-            terminal.warn(
-                f"warning: {where}: left out: the return of run {key[0]}, seed {key[1]} is not "
-                "finite"
-            )
-            diverged.append(key)
-        else:
-            rows.append(_row(data, where))
+        diverged = isinstance(final, dict) and final.get("return_mean", 0) is None
+        rows[key] = None if diverged else _row(data, where)
+        if diverged:
+            terminal.warn(f"warning: {where}: left out: the return of {run} is not finite")
     if b"\n" in path.read_bytes()[end:]:
         raise ConfigError(f"{path} line {number + 1}: must be an object in JSON")
-    return tuple(rows), tuple(diverged)
+    return rows
 
 
 PATHS = {
@@ -158,15 +143,6 @@ PATHS = {
 """Places of the fields of a `Row` in the file, where they differ from its names."""
 
 _KINDS = get_type_hints(Row)
-
-_NAMES = {
-    str: "a string",
-    int: "a whole number",
-    float: "a number",
-    dict: "an object",
-    np.ndarray: "a list of numbers",
-    NoneType: "null",
-}
 
 
 def _row(data: dict[str, Any], where: str) -> Row:
@@ -183,24 +159,17 @@ def _row(data: dict[str, Any], where: str) -> Row:
 
 
 def _field(data: Any, name: str, where: str) -> Any:
-    """Return the value of a field, lists as arrays [N] with NaN for null."""
-    path = PATHS.get(name, name)
-    kinds = get_args(_KINDS[name]) or (_KINDS[name],)
+    """Return the value of a field; null if it is missing, lists as arrays [N] with NaN for null."""
+    path, kind = PATHS.get(name, name), _KINDS[name]
+    value = data
     for part in path.split("."):
-        if data is None and NoneType in kinds:
-            return None
-        if not isinstance(data, dict) or part not in data:
-            raise ConfigError(f"{where}: {path}: missing")
-        data = data[part]
-    if np.ndarray in kinds and type(data) is list:
-        if all(value is None or type(value) in (int, float) for value in data):
-            return np.array(data, float)
-    elif float in kinds and type(data) in (int, float):
-        if math.isfinite(data):
-            return float(data)
-    elif type(data) in kinds:
-        return data
-    raise ConfigError(f"{where}: {path}: must be {' or '.join(_NAMES[kind] for kind in kinds)}")
+        value = value.get(part) if isinstance(value, dict) else None
+    if kind is np.ndarray and isinstance(value, list):
+        with contextlib.suppress(TypeError, ValueError):
+            return np.array(value, float)
+    elif isinstance(value, kind) or (type(value) is int and float in (kind, *get_args(kind))):
+        return value
+    raise ConfigError(f"{where}: {path}: must be {getattr(kind, '__name__', kind)}, not {value!r}")
 
 
 class Published(NamedTuple):
@@ -217,17 +186,9 @@ class Published(NamedTuple):
 
 def published() -> list[Published]:
     """Return the published results of published.csv."""
+    kinds = (str, int, str, float, float, int, str)
     with Path(__file__).with_name("published.csv").open(newline="") as file:
-        rows = list(csv.reader(file))[1:]
-    return [
-        Published(
-            task,
-            int(samples),
-            algorithm,
-            float(mean),
-            float(spread) if spread else None,
-            int(seeds) if seeds else None,
-            source,
-        )
-        for task, samples, algorithm, mean, spread, seeds, source in rows
-    ]
+        return [
+            Published._make(kind(x) if x else None for kind, x in zip(kinds, row, strict=True))
+            for row in list(csv.reader(file))[1:]
+        ]

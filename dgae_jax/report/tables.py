@@ -40,16 +40,7 @@ def returns(groups: Iterable[Group]) -> Table:
     for group in groups:
         best = [row.best for row in group.rows if row.best is not None]
         seeds = " · ".join(number(value) for value in group.finals)
-        iqm_of_finals = between(analysis.interquartile_mean(group.finals))
-        rows.append(
-            (
-                *_key(group),
-                spread(group.finals),
-                iqm_of_finals,
-                spread(best) if best else NONE,
-                seeds,
-            )
-        )
+        rows.append((*_key(group), *_scores(group.finals), spread(best) if best else NONE, seeds))
     names = ("task", "algorithm", "seeds", "mean ± std", IQM, "best checkpoint", "each seed")
     return Table(names, rows)
 
@@ -85,22 +76,15 @@ def attribution_over_tasks(groups: Iterable[Group]) -> Table:
         end = analysis.improvement([a.finals for a, _ in pairs], [b.finals for _, b in pairs])
         run = analysis.improvement([a.averages for a, _ in pairs], [b.averages for _, b in pairs])
         seeds = sum(len(group.rows) for group, _ in pairs)
-        rows.append(
-            (name, str(len(pairs)), str(seeds), between(end, "{:.2f}"), between(run, "{:.2f}"))
-        )
+        shares = between(end, "{:.2f}"), between(run, "{:.2f}")
+        rows.append((name, str(len(pairs)), str(seeds), *shares))
     above = [f"above the first {when} [95 %]" for when in ("at the end", "over the run")]
     return Table(("variant", "tasks", "seeds", *above), rows, keys=1)
 
 
 def risk(groups: Iterable[Group]) -> Table:
     """Final returns: the mean over episodes, and the mean of their worst quarter (CVaR)."""
-    rows = []
-    for group in groups:
-        texts = [
-            (spread(scores), between(analysis.interquartile_mean(scores)))
-            for scores in (group.finals, group.worst)
-        ]
-        rows.append((*_key(group), *texts[0], *texts[1]))
+    rows = [(*_key(group), *_scores(group.finals), *_scores(group.worst)) for group in groups]
     header = ("task", "variant", "seeds", "mean ± std", IQM, "worst quarter ± std", IQM)
     return Table(header, rows)
 
@@ -109,11 +93,10 @@ def reach(groups: Iterable[Group]) -> Table:
     """Samples until the mean training return reaches shares of the task's best mean."""
     rows = []
     for members in by_task(groups).values():
-        best = analysis.best_mean(members)
-        for group in members:
-            steps = analysis.reached(group, best)
-            found = [NONE if step is None else f"{step:,}" for step in steps]
-            rows.append((group.task, group.name, NONE if best is None else f"{best:,.0f}", *found))
+        best, steps = analysis.reached(members)
+        for group, reached in zip(members, steps, strict=True):
+            found = [NONE if value is None else f"{value:,.0f}" for value in (best, *reached)]
+            rows.append((group.task, group.name, *found))
     shares = [f"samples to {100 * share:.0f} %" for share in analysis.REACH]
     return Table(("task", "algorithm", "best mean", *shares), rows)
 
@@ -146,7 +129,7 @@ def published(results: Iterable[Published]) -> Table:
     rows = []
     for one in results:
         value = number(one.mean) + ("" if one.spread is None else f" ± {number(one.spread)}")
-        seeds = NONE if one.seeds is None else str(one.seeds)
+        seeds = str(one.seeds or NONE)
         rows.append((one.task, one.algorithm, f"{one.samples:,}", value, seeds, one.source))
     return Table(("task", "algorithm", "samples", "mean ± spread", "seeds", "source"), rows)
 
@@ -168,6 +151,10 @@ def comparison(first: Iterable[Group], second: Iterable[Group], names: tuple[str
 
 def _key(group: Group) -> tuple[str, str, str]:
     return group.task, group.name, str(len(group.rows))
+
+
+def _scores(scores: np.ndarray) -> tuple[str, str]:
+    return spread(scores), between(analysis.interquartile_mean(scores))
 
 
 def _difference(first: np.ndarray, second: np.ndarray) -> str:

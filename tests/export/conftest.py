@@ -54,10 +54,6 @@ class Untrained(NamedTuple):
     file: str
     networks: checkpoint.Networks
 
-    @property
-    def policy(self):
-        return dg.load_policy(self.file, seed=self.index)
-
 
 @pytest.fixture(scope="session", params=CONFIGS)
 def untrained(request, tmp_path_factory):
@@ -82,6 +78,6 @@ def make_untrained(name, directory):
 
 @pytest.fixture(scope="session")
 def opengl():
-    """Skip where nothing can be drawn."""
-    if not any(gl.works(backend) for backend in gl.CANDIDATES):
-        pytest.skip(f"neither {' nor '.join(gl.CANDIDATES)} works here")
+    """Return a backend that works here."""
+    backend = next(filter(gl.works, gl.CANDIDATES), None)
+    return backend or pytest.skip(f"neither {' nor '.join(gl.CANDIDATES)} works here")

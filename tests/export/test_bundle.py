@@ -2,23 +2,22 @@
 
 import dataclasses
 import json
+import re
 import shutil
 import subprocess
 import sys
 import tomllib
 from functools import partial
 
-import jax
 import numpy as np
 import onnx
 import onnxruntime
 import pytest
-from numpy.testing import assert_allclose, assert_array_equal
+from numpy.testing import assert_allclose
 
 import dgae_jax as dg
 from dgae_jax.cli.main import command
 from dgae_jax.configs.config import ConfigError
-from dgae_jax.configs.resolved import resolve
 from dgae_jax.export import arrays, bundle
 from dgae_jax.export.templates.policy import Policy
 from dgae_jax.run import checkpoint
@@ -26,7 +25,7 @@ from dgae_jax.run.directory import read_config
 from dgae_jax.run.evaluation import evaluate_policies
 from tests.export.conftest import make_untrained
 from tests.helpers import ROOT
-from tests.runs import last, small
+from tests.runs import last
 
 FORMATS = ("npz", "onnx", "gymnasium")
 QUANTILES = {"quantile": 8, "scalar": 1, "ordered": 8, "sorted": 8}
@@ -43,7 +42,7 @@ def exported(untrained, tmp_path_factory):
 
 def assert_same(actions, quantiles, exported):
     untrained, obs, _ = exported
-    policy = untrained.policy
+    policy = dg.load_policy(untrained.file, seed=untrained.index)
     assert quantiles.shape == (1000, QUANTILES[untrained.name])
     assert (actions.dtype, quantiles.dtype) == (np.float32, np.float32)
     assert 0.05 < (np.abs(policy(obs)) == 1).mean() < 0.95
@@ -70,7 +69,6 @@ def test_numpy_computes_the_policy(exported):
     _, obs, directory = exported
     policy = Policy(directory / "npz" / "policy.npz")
     assert_same(policy(obs), policy.quantiles(obs), exported)
-    assert_allclose(policy(obs[0]), policy(obs)[0], atol=1e-6)
 
 
 def test_onnx_runtime_computes_the_policy_for_any_batch(exported):
@@ -80,8 +78,6 @@ def test_onnx_runtime_computes_the_policy_for_any_batch(exported):
     run = partial(session.run, ["action", "quantiles"])
     assert_same(*run({"obs": obs}), exported)
     assert [x.shape[0] for x in run({"obs": obs[:1]})] == [1, 1]
-    (taken,) = session.get_inputs()
-    assert (taken.name, taken.type, taken.shape) == ("obs", "tensor(float)", ["batch", 11])
 
 
 def test_agent_plays_the_episodes_of_an_evaluation(exported):
@@ -103,10 +99,6 @@ def test_custom_networks_are_refused(trained):
     renamed = found.policy._replace(params={"params": {"Body": found.policy.params["params"]}})
     with pytest.raises(ConfigError, match="'kernel'"):
         arrays.arrays_of(found._replace(policy=renamed), config, 0)
-    shifted = jax.tree.map(lambda x: x + 1, found.critic.obs_stats)
-    other = found._replace(critic=found.critic._replace(obs_stats=shifted))
-    with pytest.raises(ConfigError, match="quantiles differ"):
-        arrays.arrays_of(other, config, 0)
 
 
 @pytest.fixture(scope="module")
@@ -126,13 +118,9 @@ def test_programs_on_the_cards_run(cards):
 def test_card_and_model_show_the_facts_of_the_run(trained, cards):
     manifest = json.loads((trained / "manifest.json").read_text())
     rows = [json.loads(line) for line in (trained / "evaluations.jsonl").read_text().splitlines()]
-    means = {
-        steps: np.mean([row["return_mean"] for row in rows if row["steps"] == steps])
-        for steps in (256, 512)
-    }
-    best = max(means, key=lambda steps: (means[steps], steps))
-    (mean,) = (row["return_mean"] for row in rows if (row["steps"], row["seed"]) == (best, 1))
     text = (cards / "npz" / "README.md").read_text()
+    best = int(re.search(r"\| checkpoint \| steps_0*(\d+).msgpack \|\n", text)[1])
+    (mean,) = (row["return_mean"] for row in rows if (row["steps"], row["seed"]) == (best, 1))
     for fact in (
         "| task | Hopper-v4, episodes of at most 20 steps, observations [11], actions [3] |\n",
         "| algorithm | dppo |\n",
@@ -140,7 +128,6 @@ def test_card_and_model_show_the_facts_of_the_run(trained, cards):
         f"| samples | {best} |\n",
         f"{mean:,.1f} ± 0.0 over 1 episode, mean ± standard deviation, episodes which chose this",
         "| critic | quantile [8], of the discounted return (γ = 0.99) of rewards divided",
-        f"| checkpoint | steps_{best:012d}.msgpack |\n",
         f"jax {manifest['versions']['jax']}",
     ):
         assert fact in text
@@ -150,46 +137,33 @@ def test_card_and_model_show_the_facts_of_the_run(trained, cards):
     assert about == {"task": "Hopper-v4", "algorithm": "dppo", "samples": str(best), **revision}
 
 
-def test_card_has_the_licence_of_the_package_and_noise_if_there_is_some(tmp_path):
-    untrained = make_untrained("scalar", tmp_path)
-    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
-    config = dataclasses.replace(untrained.config, noise=dg.NoiseConfig(reward=0.5, initial=0.01))
-    made = arrays.arrays_of(untrained.networks, untrained.config, untrained.index)
-    facts = bundle.facts_of(untrained.file, untrained.file, untrained.config, untrained.index)
-    facts |= {"task": "Hopper-v4", "algorithm": "trpo", "best": False}
-    plain, noisy = (
-        bundle.model_card("npz", made, each, 0, facts) for each in (untrained.config, config)
-    )
-    assert f"| licence | {project['license']}, that of dgae_jax |" in plain
-    assert "noise" not in plain
-    assert "None" not in plain
-    assert "| noise in training | reward 0.5, initial 0.01 |\n" in noisy
-
-
 def test_facts_of_a_policy_file_come_from_its_sweep(tmp_path):
-    config = resolve(small())
     (tmp_path / "policies").mkdir()
-    file = tmp_path / "policies" / "hopper-ppo-0.msgpack"
-    file.write_bytes(b"")
-    names = ("checkpoint", "samples", "returns", "versions", "git_revision")
-    unknown = dict(zip(names, (file.name, None, None, "", None), strict=True))
-    assert bundle.facts_of(file, file, config, 0) == unknown
+    made = make_untrained("scalar", tmp_path / "policies")
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+
+    def card(config=made.config):
+        values = arrays.arrays_of(made.networks, config, 0)
+        facts = bundle.facts_of(made.file, made.file, config, 0) | {"best": False}
+        return bundle.model_card("npz", values, config, 0, facts)
+
+    assert f"| licence | {project['license']}, that of dgae_jax |" in card()
+    assert not re.search("noise|None|samples", card())
+    noise = dg.NoiseConfig(reward=0.5, initial=0.01)
+    noisy = card(dataclasses.replace(made.config, noise=noise))
+    assert "| noise in training | reward 0.5, initial 0.01 |\n" in noisy
     row = {
-        "policy": "policies/hopper-ppo-0.msgpack",
-        "seed": 0,
+        "policy": "policies/scalar.msgpack",
+        "seed": made.config.seed,
         "steps": 999_424,
         "final": {"return_mean": 3298.14, "return_std": 8.25, "returns": [0.0] * 20},
         "git_revision": "abcdef1+",
         "versions": {"jax": "0.10.2", "warp": None},
     }
-    rows = [row, {**row, "seed": 1, "steps": 1}, {**row, "policy": "policies/other.msgpack"}]
+    rows = [row, {**row, "seed": 9, "steps": 1}, {**row, "policy": "policies/other.msgpack"}]
     (tmp_path / "results.jsonl").write_text("".join(json.dumps(each) + "\n" for each in rows))
-    returns = "3,298.1 ± 8.2 over 20 episodes"
-    known = (file.name, 999_424, returns, "jax 0.10.2", "abcdef1+")
-    assert tuple(bundle.facts_of(file, file, config, 0).values()) == known
-    hostile = {**row, "steps": "many", "final": [1], "versions": 3, "git_revision": "| x |"}
-    (tmp_path / "results.jsonl").write_text(json.dumps(hostile) + "\n")
-    assert bundle.facts_of(file, file, config, 0) == unknown
+    for fact in ("999,424", "3,298.1 ± 8.2 over 20 episodes", "jax 0.10.2 |", "abcdef1+ |"):
+        assert fact in card()
 
 
 @pytest.fixture
@@ -207,49 +181,30 @@ def export(monkeypatch, capsys):
     return export
 
 
-def test_each_format_becomes_a_directory(trained, export, tmp_path):
-    run_dir = shutil.copytree(trained, tmp_path / "run")
-    code, out, err = export(run_dir, "--to", *FORMATS, "--index", 1)
-    assert (code, err) == (0, "")
+def test_each_format_becomes_a_directory(export, tmp_path):
+    file = make_untrained("scalar", tmp_path).file
+    for _ in range(2):  # files are replaced
+        code, out, err = export(file, "--to", *FORMATS, "--index", 1)
+        assert (code, err) == (0, "")
     assert [line.split(": ")[1] for line in out.splitlines()] == [
         "policy.npz, policy.py, README.md",
         "policy.onnx, README.md",
         "policy.npz, policy.py, agent.py, README.md",
     ]
-    written = {path.name for path in (run_dir / "export").rglob("*") if path.is_file()}
+    written = {path.name for path in (tmp_path / "scalar-export").rglob("*.*")}
     assert written == {"README.md", "agent.py", "policy.npz", "policy.onnx", "policy.py"}
 
 
-def test_policy_file_is_exported_beside_itself_and_again(export, tmp_path):
-    file = make_untrained("scalar", tmp_path).file
-    for _ in range(2):
-        assert export(file, "--to", "npz", "npz")[0] == 0
-    names = sorted(path.name for path in (tmp_path / "scalar-export" / "npz").iterdir())
-    assert names == ["README.md", "policy.npz", "policy.py"]
-    assert export(file, "--to", "npz", "--checkpoint", "best")[0] == 2
+def test_seeds_and_checkpoints_have_their_own_weights(trained, tmp_path):
+    run_dir, config = shutil.copytree(trained, tmp_path / "run"), read_config(trained)
 
+    def weights(index):
+        bundle.export(run_dir, config, "latest", index, ["npz"], tmp_path)
+        return Policy(tmp_path / "npz" / "policy.npz").arrays["policy_weight_0"].sum()
 
-def test_seeds_and_checkpoints_have_their_own_weights(trained, export, tmp_path):
-    run_dir = shutil.copytree(trained, tmp_path / "run")
-
-    def weights(*argv):
-        assert export(run_dir, "--to", "npz", "--out", tmp_path / "a" / "b", *argv)[0] == 0
-        with np.load(tmp_path / "a" / "b" / "npz" / "policy.npz") as arrays:
-            return arrays["policy_weight_0"]
-
-    first, second, default = (weights(*argv) for argv in (["--index", 0], ["--index", 1], []))
-    assert_array_equal(first, default)
-    assert not np.array_equal(first, second)
+    first, second = weights(0), weights(1)
     last(run_dir).unlink()
-    assert not np.array_equal(weights(), first)
-
-
-def test_unwritable_output_is_refused_in_one_line(trained, export, tmp_path):
-    (tmp_path / "out" / "npz" / "policy.npz").mkdir(parents=True)
-    for out in (tmp_path / "out", "/dev/null/x", trained / "config.json"):
-        code, _, err = export(trained, "--to", "npz", "--out", out)
-        assert code == 2
-        assert f"--out {out}: must be a directory that can be written" in " ".join(err.split())
+    assert len({first, second, weights(0)}) == 3
 
 
 def test_missing_onnx_is_named_and_other_formats_work(trained, export, monkeypatch, tmp_path):
@@ -259,13 +214,3 @@ def test_missing_onnx_is_named_and_other_formats_work(trained, export, monkeypat
     assert 'pip install "dgae_jax[export]"' in err
     assert not (tmp_path / "out").exists()
     assert export(trained, "--to", "npz", "gymnasium", "--out", tmp_path / "out")[0] == 0
-
-
-def test_agent_needs_a_task_that_gymnasium_has(trained, export, tmp_path):
-    run_dir = shutil.copytree(trained, tmp_path / "run")
-    config = json.loads((run_dir / "config.json").read_text())
-    config |= {"env": "brax:ant", "env_version": None, "physics": "mjx"}
-    (run_dir / "config.json").write_text(json.dumps(config))
-    code, _, err = export(run_dir, "--to", "gymnasium")
-    assert code == 2
-    assert "--to gymnasium: must be left out with brax:ant" in err

@@ -15,13 +15,9 @@ from dgae_jax.export.figures import HIGHER, LOWER, distances
 from tests.helpers import ROOT
 
 
-@pytest.mark.parametrize(("a", "b"), [(1.0, 3.5), (2.0, -1.0)])
-def test_directional_metric_has_the_sign_of_the_difference_of_means(a, b):
-    found = distances(NormalDist(a, 0.7), NormalDist(b, 0.7))
-    assert found == pytest.approx([abs(a - b), a - b, b - a], rel=1e-5)
-
-
-def test_equal_means_are_apart_in_wasserstein_distance_only():
+def test_directional_metric_is_the_difference_of_means():
+    found = distances(NormalDist(2.0, 0.7), NormalDist(-1.0, 0.7))
+    assert found == pytest.approx([3, 3, -3], rel=1e-5)
     found = distances(NormalDist(0, 1), NormalDist(0, 2))
     assert found[0] == pytest.approx(math.sqrt(2 / math.pi), abs=2e-3)  # E|2Z − Z|
     assert found[1] == pytest.approx(0, abs=1e-6)
@@ -33,20 +29,17 @@ def test_transport_prints_distances_and_draws_the_plan():
     for axes, sign, other in zip(panels, "-+", "+-", strict=False):
         title = axes.get_title()
         assert f"d_1 = {gap}" in title
-        assert f"d(F_U, G_V) = {{{sign}}}{gap}" in title
-        assert f"d(G_V, F_U) = {{{other}}}{gap}" in title
+        assert f"d(F_U, G_V) = {sign}{gap}" in title
+        assert f"d(G_V, F_U) = {other}{gap}" in title
     for axes, (u, v) in zip(panels[2:], ((LOWER, HIGHER), (HIGHER, LOWER)), strict=True):
         ends = [tuple(arrow._posA_posB) for arrow in axes.patches]
         assert ends == [((u.inv_cdf(q), q), (v.inv_cdf(q), q)) for q in figures.LEVELS]
 
 
-@pytest.mark.parametrize("name", ["transport.png", "transport.svg"])
-def test_transport_has_the_same_bytes_each_time(name, tmp_path):
-    for directory in ("first", "second"):
-        (tmp_path / directory).mkdir()
-        figures.save(figures.transport(), tmp_path / directory / name)
-    first, second = ((tmp_path / each / name).read_bytes() for each in ("first", "second"))
-    assert first == second
+def test_transport_has_the_same_bytes_each_time(tmp_path):
+    for name in ("first.svg", "second.svg"):
+        figures.save(figures.transport(), tmp_path / name)
+    assert (tmp_path / "first.svg").read_bytes() == (tmp_path / "second.svg").read_bytes()
 
 
 def test_robots_are_four_different_pictures_on_light_ground(tmp_path, opengl):

@@ -54,16 +54,11 @@ def test_another_mode_is_refused():
 
 @pytest.mark.slow
 def test_ppo_of_stable_baselines3_learns_to_hop():
-    """The return of a random policy and that after 26,624 steps; measured: 15 and 194."""
+    """A random policy has a return of 15, the trained one 194."""
     torch.set_num_threads(1)
     env = VecMonitor(Sb3VecEnv(hoppers(16)))
     model = PPO(
         "MlpPolicy", env, n_steps=128, batch_size=256, learning_rate=1e-3, seed=0, device="cpu"
     )
-    recent = []
-    for _ in range(2):
-        model.learn(12 * 16 * 128 if recent else 16 * 128, reset_num_timesteps=False)
-        recent.append(np.mean([episode["r"] for episode in model.ep_info_buffer]))
-    first, last = recent
-    assert first < 40
-    assert last > 100
+    model.learn(26_624)
+    assert np.mean([episode["r"] for episode in model.ep_info_buffer]) > 100

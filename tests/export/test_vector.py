@@ -3,7 +3,6 @@
 import functools
 import itertools
 import os
-import re
 import subprocess
 import sys
 import warnings
@@ -13,7 +12,7 @@ import jax
 import numpy as np
 import pytest
 from brax.envs.wrappers.training import EpisodeWrapper
-from gymnasium.error import ClosedEnvironmentError, ResetNeeded
+from gymnasium.error import ResetNeeded
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from numpy.testing import assert_allclose, assert_array_equal
 
@@ -52,13 +51,11 @@ class Placed(gymnasium.Wrapper):
 
 def gymnasiums_own(name, version, mode, num_envs, limit):
     def make():
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # that v4 is not the latest version is known
-            return Placed(
-                gymnasium.make(f"{GYM_TASKS[name].NAME}-{version}", max_episode_steps=limit)
-            )
+        return Placed(gymnasium.make(f"{GYM_TASKS[name].NAME}-{version}", max_episode_steps=limit))
 
-    return SyncVectorEnv([make] * num_envs, autoreset_mode=mode)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # that v4 is not the latest version is known
+        return SyncVectorEnv([make] * num_envs, autoreset_mode=mode)
 
 
 def place(theirs, ours):
@@ -105,13 +102,8 @@ CASES = [
 def test_native_in_float64_equals_gymnasium(name, version, mode):
     count, limit, falls, limits = 3, 20, 0, 0
     with jax.enable_x64(True):
-        ours = dg.make_vector_env(
-            *(name, count),
-            physics="native",
-            version=version,
-            autoreset_mode=mode,
-            max_episode_steps=limit,
-        )
+        options = {"version": version, "autoreset_mode": mode, "max_episode_steps": limit}
+        ours = dg.make_vector_env(name, count, physics="native", **options)
         theirs = gymnasiums_own(name, version, mode, count, limit)
         assert ours.metadata["autoreset_mode"] is theirs.metadata["autoreset_mode"]
         for space in ("observation_space", "action_space"):
@@ -139,43 +131,16 @@ def test_native_in_float64_equals_gymnasium(name, version, mode):
     assert falls > 0 or name != "hopper"
 
 
-def played(env, steps, **reset):
-    first = env.reset(**reset)[0]
-    return [first, *(env.step(action)[:4] for action in random_actions(env, steps))]
-
-
-def test_equal_seeds_give_equal_bits():
-    env = hoppers()
-    first, again, listed, other = (played(env, 25, seed=seed) for seed in (7, 7, [7, 8, 9], 8))
-    jax.tree.map(assert_array_equal, first, again)
-    jax.tree.map(assert_array_equal, first, listed)
-    assert_array_equal(first[0][1:], other[0][:2])
-    assert (first[0][0] != other[0][0]).all()
-
-
 def test_each_env_has_its_own_random_stream():
-    env = hoppers("Disabled")
+    env, mask = hoppers("Disabled"), np.array([False, True, False])
+    obs = env.reset(seed=7)[0]
+    assert_array_equal(env.reset(seed=[7, 8, 9])[0], obs)
+    assert_array_equal(env.reset(seed=8)[0][:2], obs[1:])
     first, second, third = env.reset(seed=[3, 4, 5])[0], env.reset()[0], env.reset()[0]
     assert len(np.unique(np.concatenate([first, second, third]), axis=0)) == 9
     env.reset(seed=[9, 4, 9])
-    assert env.np_random_seed == (9, 4, 9)
-    only = env.reset(options={"reset_mask": np.array([False, True, False])})[0]
-    assert_array_equal(only[1], second[1])
-    assert (only[[0, 2]] != second[[0, 2]]).all()
+    assert_array_equal(env.reset(options={"reset_mask": mask})[0][1], second[1])
     assert_array_equal(env.reset(seed=[None, None, 5])[0][1:], [third[1], first[2]])
-
-
-def test_automatic_resets_begin_as_manual_ones():
-    env = hoppers("SameStep")
-    env.reset(seed=0)
-    manual, began = env.reset()[0], np.full(3, False)
-    env.reset(seed=0)
-    for action in random_actions(env, 20):
-        obs, _, terminated, truncated, _ = env.step(action)
-        first = (terminated | truncated) & ~began
-        CLOSE(obs[first], manual[first])
-        began |= first
-    assert began.all()
 
 
 def test_set_state_moves_every_env():
@@ -197,10 +162,7 @@ def test_nonfinite_env_terminates_and_is_reported():
     assert not truncated.any()
     assert (reward[1], infos["x_velocity"][1]) == (0, 0)
     assert_array_equal(obs[1], before[1])
-    obs, _, terminated, _, infos = env.step(np.zeros_like(bad))
-    assert np.isfinite(obs).all()
-    assert not terminated.any()
-    assert infos["_nonfinite"].tolist() == [True, False, True]
+    assert np.isfinite(env.step(np.zeros_like(bad))[0]).all()
 
 
 def test_gymnasium_makes_it_by_name():
@@ -209,18 +171,14 @@ def test_gymnasium_makes_it_by_name():
     assert (env.spec.id, env.num_envs) == ("dgae_jax/Hopper-v5", 2)
     assert env.spec.kwargs["max_episode_steps"] == 1000
     assert (env.env.dt, env.env.healthy_reward) == (0.008, 3)
-    names = {f"dgae_jax/{task.NAME}-{v}" for task in GYM_TASKS.values() for v in ("v4", "v5")}
-    assert names <= set(gymnasium.registry)
 
 
 @pytest.mark.parametrize(
     ("options", "message"),
     [
         ({"name": "hoper"}, "environment hoper: must be one of ant"),
-        ({"physics": "bullet"}, "physics bullet: must be one of jax"),
-        ({"num_envs": 0}, "num_envs 0: must be a whole number"),
-        ({"max_episode_steps": 0}, "max_episode_steps 0: must be a whole number"),
-        ({"autoreset_mode": "Never"}, "autoreset_mode Never: must be one of NextStep"),
+        ({"num_envs": 0}, "num_envs 0: must be at least 1"),
+        ({"autoreset_mode": "Never"}, "'Never' is not a valid AutoresetMode"),
         ({"render_mode": "human"}, "render_mode human: must be left out, or rgb_array"),
         ({"name": "gymnasium:Pendulum-v1", "physics": None}, "name gymnasium:.*a task in JAX"),
     ],
@@ -230,57 +188,35 @@ def test_invalid_arguments_are_refused(options, message):
         dg.make_vector_env(**{"name": "hopper", "num_envs": 2, "physics": "native", **options})
 
 
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"seed": -1}, "seed -1: must be a number of at least 0"),
-        ({"seed": [1, 2]}, "seed [1, 2]: must be a number of at least 0, or a list of 3"),
-        ({"seed": [1, 2, 0.5]}, "seed [1, 2, 0.5]: must be"),
-        ({"options": {"pose": 1}}, "options 'pose': must be reset_mask, or left out"),
-        ({"options": {"reset_mask": np.array([True])}}, "reset_mask [ True]: must be 3 booleans"),
-        ({"options": {"reset_mask": np.zeros(3, bool)}}, "reset_mask [False False False]: must be"),
-        ({"options": {"reset_mask": np.ones(3)}}, "reset_mask [1. 1. 1.]: must be"),
-    ],
-)
-def test_invalid_resets_are_refused(options, message):
-    with pytest.raises(ValueError, match=f"^{re.escape(message)}"):
-        hoppers().reset(**options)
-
-
-def test_calls_at_the_wrong_time_are_refused():
+def test_invalid_steps_and_resets_are_refused():
     env = hoppers("Disabled", limit=1)
     still = np.zeros((3, 3), np.float32)
-    with pytest.raises(ResetNeeded, match="call reset before"):
+    with pytest.raises(ResetNeeded, match=r"envs \[0 1 2\] are in no episode"):
         env.step(still)
-    with pytest.raises(ResetNeeded, match="the first reset must be of all envs"):
-        env.reset(options={"reset_mask": np.array([True, False, False])})
+    with pytest.raises(ValueError, match=r"seed \[1, 2\]: must be a number, or a list of 3"):
+        env.reset(seed=[1, 2])
+    with pytest.raises(ValueError, match=r"reset_mask .*: must be 3 booleans"):
+        env.reset(options={"reset_mask": np.ones(3)})
     env.reset()
-    with pytest.raises(ValueError, match=r"^actions of shape \(3, 2\): must be of shape \(3, 3\)"):
+    with pytest.raises(ValueError, match=r"^actions of \(3, 2\): must be of shape \(3, 3\)"):
         env.step(still[:, :2])
     env.step(still)
     env.reset(options={"reset_mask": np.array([False, True, False])})
-    with pytest.raises(ResetNeeded, match=r"episodes of envs \[0, 2\] have ended"):
+    with pytest.raises(ResetNeeded, match=r"envs \[0 2\] are in no episode"):
         env.step(still)
-    env.close()
-    with pytest.raises(ClosedEnvironmentError):
-        env.reset()
 
 
 @pytest.mark.slow
-def test_render_draws_every_env():
-    backend = next((name for name in gl.CANDIDATES if gl.works(name)), None)
-    if backend is None:
-        pytest.skip(f"neither {' nor '.join(gl.CANDIDATES)} works here")
+def test_render_draws_every_env(opengl):
     program = """
 import dgae_jax as dg
 env = dg.make_vector_env("walker2d", 2, physics="native", render_mode="rgb_array")
 env.reset(seed=0)
 one, two = env.render()
-assert one.shape == two.shape == (480, 480, 3)
-assert one.std() > 10 and (one != two).any()
+assert one.shape == two.shape == (480, 480, 3) and one.std() > 10 and (one != two).any()
 env.close()
 """
-    environment = {**os.environ, gl.VARIABLE: backend}
+    environment = {**os.environ, gl.VARIABLE: opengl}
     subprocess.run([sys.executable, "-c", program], check=True, env=environment)
 
 
@@ -289,6 +225,4 @@ def test_the_tasks_own_time_limit_truncates():
         envs = dg.make_vector_env(name, 2)
     envs.reset(seed=0)
     ends = [envs.step(np.zeros((2, 1)))[2:4] for _ in range(5)]
-    assert not np.any([terminated for terminated, _ in ends])
-    assert_array_equal([truncated for _, truncated in ends], [[False] * 2] * 4 + [[True] * 2])
-    assert envs.metadata["render_modes"] == []
+    assert_array_equal(ends, [[[False] * 2] * 2] * 4 + [[[False] * 2, [True] * 2]])

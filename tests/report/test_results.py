@@ -42,16 +42,9 @@ def test_configuration_of_an_older_schema_is_upgraded(tmp_path):
 
 def test_file_of_results_is_a_sweep_without_a_plan(tmp_path):
     directory = study(tmp_path / "one", [row()], planned=["hopper-dppo-1"])
-    assert results.read(directory).missing == ["hopper-dppo-1"]
+    assert results.read(directory).missing == ("hopper-dppo-1",)
     alone = results.read(directory / "results.jsonl")
-    assert (len(alone.rows), alone.missing, alone.name) == (1, [], "one")
-
-
-def test_row_that_is_still_being_written_is_not_read(tmp_path):
-    directory = study(tmp_path, [row(seed=0)])
-    with (directory / "results.jsonl").open("a") as file:
-        file.write(json.dumps(row(seed=1))[:100])
-    assert [each.seed for each in results.read(directory).rows] == [0]
+    assert (len(alone.rows), alone.missing, alone.name) == (1, (), "one")
 
 
 def test_directory_that_is_no_sweep_is_refused(tmp_path):
@@ -65,17 +58,16 @@ def test_directory_that_is_no_sweep_is_refused(tmp_path):
     assert refusal(tmp_path).startswith(f"{tmp_path}/study.json: must be an object")
 
 
-def test_line_that_is_no_row_is_refused_by_its_number(tmp_path):
-    diverged = row(seed=1, final={"engine": "jax", "return_mean": None, "returns": [None]})
-    lines = [json.dumps(row(seed=0)), json.dumps(diverged), "torn", json.dumps(row(seed=2)), ""]
-    directory = study(tmp_path, [row(seed=0)])
-    (directory / "results.jsonl").write_text("\n".join(lines))
-    assert refusal(directory) == f"{directory}/results.jsonl line 3: must be an object in JSON"
-
-
-def test_seed_that_is_there_twice_is_refused(tmp_path):
+def test_rows_are_refused_by_their_number(tmp_path):
     refused = refusal(study(tmp_path, [row(), row()]))
     assert refused.endswith("line 2: run hopper-dppo-0, seed 0 is there twice")
+    torn = json.dumps(row(seed=1))[:100]
+    with (study(tmp_path, [row(seed=0)]) / "results.jsonl").open("a") as file:
+        file.write(torn)
+        file.flush()
+        assert [each.seed for each in results.read(tmp_path).rows] == [0]  # still being written
+        file.write("\n")
+    assert refusal(tmp_path) == f"{tmp_path}/results.jsonl line 2: must be an object in JSON"
 
 
 UNEVEN = "curve: must have increasing steps and a return for each"
@@ -85,15 +77,14 @@ UNEVEN = "curve: must have increasing steps and a return for each"
     ("change", "sentence"),
     [
         ({"algo": "sac"}, "algo: must be one of ppo, dppo, trpo, dtrpo, a2c, da2c"),
-        ({"seed": True}, "seed: must be a whole number"),
-        ({"env_version": 4}, "env_version: must be a string or null"),
-        ({"seconds": None}, "seconds: must be a number"),
-        ({"seconds": float("inf")}, "seconds: must be a number"),
-        ({"final": None}, "final.engine: missing"),
-        ({"best": {"steps": 5}}, "best.return_mean: missing"),
+        ({"seed": "1"}, "seed: must be int, not '1'"),
+        ({"env_version": 4}, "env_version: must be str | None, not 4"),
+        ({"seconds": None}, "seconds: must be float, not None"),
+        ({"final": None}, "final.engine: must be str, not None"),
+        ({"best": {"return_mean": "x"}}, "best.return_mean: must be float | None, not 'x'"),
         ({"curve": {"steps": [1, 2], "return": [1.0]}}, UNEVEN),
         ({"curve": {"steps": [2, 2], "return": [1.0, 2.0]}}, UNEVEN),
-        ({"curve": {"steps": [1], "return": ["x"]}}, "curve.return: must be a list of numbers"),
+        ({"curve": {"steps": [1], "return": ["x"]}}, "curve.return: must be ndarray, not ['x']"),
         ({"config": {"schema": 99}}, "config: schema 99: must be one of 2, 3"),
     ],
 )
@@ -106,8 +97,8 @@ def test_run_whose_return_is_not_finite_is_left_out_with_a_warning(tmp_path, cap
     diverged = row(seed=1, final={"engine": "jax", "return_mean": None, "returns": [None, 2.0]})
     found = results.read(study(tmp_path, [row(seed=0), diverged, row(seed=2)]))
     assert [each.seed for each in found.rows] == [0, 2]
-    assert (found.diverged, found.missing) == ((("hopper-dppo-1", 1),), [])
-    assert "line 2: left out: the return of run hopper-dppo-1, seed 1" in capsys.readouterr().err
+    assert (found.diverged, found.missing) == ((("hopper-dppo-1", 1),), ())
+    assert "line 2: left out: the return of hopper-dppo-1" in capsys.readouterr().err
 
 
 def test_published_results_cover_every_task():

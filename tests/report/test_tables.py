@@ -83,7 +83,7 @@ def block(name, inside=""):
     return f"<!-- dgae report: {name} -->\n{inside}<!-- /dgae report -->\n"
 
 
-def test_every_table_of_a_document_is_replaced_and_the_rest_stays(grouped, tmp_path):
+def test_tables_of_a_document_are_replaced_and_the_rest_stays(grouped, tmp_path):
     path, groups, old = tmp_path / "doc.md", grouped(plain([1, 3])), "| old |\n"
     path.write_text(f"# Title\n{block('returns', old)}between\n{block('speed')}end\n")
     returns, speed = (tables.markdown(t(groups)) + "\n" for t in (tables.returns, tables.speed))
@@ -92,19 +92,14 @@ def test_every_table_of_a_document_is_replaced_and_the_rest_stays(grouped, tmp_p
         assert markdown.replace(path, groups, "sweep") == ["returns", "speed"]
         new = f"# Title\n{block('returns', returns)}between\n{block('speed', speed)}end\n"
         assert path.read_text() == new
-
-
-def test_table_of_another_sweep_stays(grouped, tmp_path):
-    path, groups = tmp_path / "doc.md", grouped(plain([1, 3]))
     path.write_text(block("returns of short") + block("speed of long"))
     assert markdown.replace(path, groups, "long") == ["speed"]
-    speed = tables.markdown(tables.speed(groups)) + "\n"
     assert path.read_text() == block("returns of short") + block("speed of long", speed)
     with pytest.raises(ConfigError, match="a table of other; its tables are of short, long"):
-        markdown.check(path, "other")
+        markdown.find(path, "other")
 
 
-MARKERS = "with each table between <!-- dgae report: NAME --> and <!-- /dgae report -->"
+MARKERS = "with tables between lines <!-- dgae report: NAME --> and <!-- /dgae report -->"
 
 
 @pytest.mark.parametrize(
@@ -113,8 +108,7 @@ MARKERS = "with each table between <!-- dgae report: NAME --> and <!-- /dgae rep
         ("nothing", MARKERS),
         ("\xff", "not text in UTF-8"),
         ("<!-- dgae report: returns -->\n" + block("speed"), MARKERS),
-        ("<!-- /dgae report -->\n" + block("speed"), MARKERS),
-        (block("x"), "risk, reach, speed, not x"),
+        (block("x"), "NAME is one of iqm, returns"),
         (block("returns") + block("speed of long"), "with NAME of SWEEP for all tables"),
     ],
 )
@@ -122,6 +116,6 @@ def test_markers_that_do_not_match_are_refused(text, sentence, tmp_path):
     path = tmp_path / "doc.md"
     path.write_bytes(text.encode("latin-1"))
     with pytest.raises(ConfigError) as caught:
-        markdown.check(path, "sweep")
+        markdown.find(path, "sweep")
     assert str(caught.value).startswith(f"markdown {path}: must be a file ")
     assert sentence in str(caught.value)

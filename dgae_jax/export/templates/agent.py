@@ -10,15 +10,6 @@ import numpy as np
 from policy import Policy
 
 
-def make_env(policy: Policy) -> Any:
-    """Make the task that the policy was trained on, with the same time limit."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # a v4 task warns that it is not the latest version
-        return gymnasium.make(
-            str(policy.arrays["env"]), max_episode_steps=int(policy.arrays["episode_length"])
-        )
-
-
 def play(env: Any, policy: Policy, seed: int) -> float:
     """Return the undiscounted return of the episode that begins with this seed."""
     obs, _ = env.reset(seed=seed)
@@ -33,14 +24,14 @@ def main() -> None:
     """Play, and print the returns."""
     parser = argparse.ArgumentParser(description="Play a trained policy in Gymnasium.")
     parser.add_argument("--episodes", type=int, default=5, help="episodes to play (default: 5)")
-    parser.add_argument(
-        "--seed", type=int, default=0, help="seed of the initial states, as in `dgae evaluate`"
-    )
+    parser.add_argument("--seed", type=int, default=0, help="as in `dgae evaluate` (default: 0)")
     args = parser.parse_args()
-    if args.episodes < 1 or args.seed < 0:
-        parser.error("--episodes must be at least 1 and --seed at least 0")
     policy = Policy(Path(__file__).with_name("policy.npz"))
-    env, returns = make_env(policy), []
+    warnings.simplefilter("ignore")  # a v4 task warns that it is not the latest version
+    env = gymnasium.make(
+        str(policy.arrays["env"]), max_episode_steps=int(policy.arrays["episode_length"])
+    )
+    returns = []
     for i in range(args.episodes):
         seed = np.random.SeedSequence((args.seed, i)).generate_state(1, np.uint64)[0]
         returns.append(play(env, policy, int(seed)))

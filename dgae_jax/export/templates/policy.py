@@ -19,10 +19,7 @@ class Policy:
         return np.clip(mean, self.arrays["action_low"], self.arrays["action_high"])
 
     def quantiles(self, obs: Any) -> np.ndarray:
-        """Return the critic's quantiles [..., K] of the discounted return, in units of training.
-
-        K is 1 for a scalar critic.
-        """
+        """Return the critic's quantiles [..., K] of the discounted return; a scalar one has 1."""
         outputs = self._network("critic", obs)
         if "critic_count" in self.arrays:
             return np.sort(outputs)
