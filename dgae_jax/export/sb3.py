@@ -67,7 +67,7 @@ class Sb3VecEnv(VecEnv):
 
     def env_method(self, method_name: str, *_, **__) -> list[Any]:
         """Raise NotImplementedError: no env is an object of its own."""
-        raise NotImplementedError(f"{method_name}: use `env`, whose attributes all envs share")
+        raise NotImplementedError(f"{method_name}: all envs share those of `env`")
 
     set_attr = env_method
 

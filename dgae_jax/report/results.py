@@ -101,8 +101,7 @@ def read(path: Path) -> Sweep:
         found = _rows(file) if file.exists() else {}
         planned = files.read_object(plan).get("cells") if plan.exists() else {}
     except OSError as reason:
-        why = f"must be a sweep that can be read ({reason.strerror})"
-        raise ConfigError(f"{path}: {why}") from reason
+        raise ConfigError(f"{path}: cannot be read ({reason.strerror})") from reason
     if planned is None:
         raise ConfigError(f"{plan}: must be an object with the runs of the sweep")
     rows = tuple(row for row in found.values() if row)
