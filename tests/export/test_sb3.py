@@ -47,11 +47,6 @@ def test_an_end_is_told_as_stable_baselines3_expects_it():
     assert min(falls, limits) > 0
 
 
-def test_another_mode_is_refused():
-    with pytest.raises(ValueError, match=r"^autoreset_mode NextStep: must be SameStep"):
-        Sb3VecEnv(hoppers(1, autoreset_mode="NextStep"))
-
-
 @pytest.mark.slow
 def test_ppo_of_stable_baselines3_learns_to_hop():
     """A random policy has a return of 15, the trained one 194."""

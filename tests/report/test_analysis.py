@@ -54,8 +54,8 @@ def test_improvement_counts_ties_half_and_agrees_with_scipy():
 
 def test_profile_is_the_share_of_seeds_above_each_score():
     strata = [np.array([0.1, 0.5]), np.array([0.9])]
-    shares = analysis.performance_profile(strata, np.array([0.0, 0.1, 0.5, 0.95]))
-    np.testing.assert_allclose(shares, [1, 2 / 3, 1 / 3, 0])
+    shares = analysis.performance_profile(strata, np.array([0.1, 0.5, 0.95]))
+    np.testing.assert_allclose(shares, [2 / 3, 1 / 3, 0])
 
 
 def test_scores_are_shares_of_the_best_mean_of_their_task(grouped):

@@ -7,11 +7,11 @@ from dgae_jax.report import markdown, tables
 from tests.report.rows import plain, row
 
 
-def test_interquartile_means_have_a_row_per_task_and_a_column_per_algorithm(grouped):
-    rows = plain([1, 2, 3, 4000], algo="ppo") + plain([7], algo="dppo") + plain([5], "ant", "dppo")
-    table = tables.interquartile_means(grouped(rows))
-    assert table.header == ("task", "DPPO", "PPO")
-    assert table.rows == [("ant-v4", "5", "–"), ("hopper-v4", "7", "2")]
+def test_interquartile_means_have_a_column_per_algorithm(grouped):
+    groups = grouped([*plain([1, 2, 3, 4000]), *plain([5], "ant", "ppo")])
+    table = tables.interquartile_means(groups)
+    assert table.header == ("task", "PPO", "DPPO")
+    assert table.rows == [("ant-v4", "5", "–"), ("hopper-v4", "–", "2")]
 
 
 def test_final_returns_have_mean_std_iqm_best_and_each_seed(grouped):
