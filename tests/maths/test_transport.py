@@ -53,7 +53,7 @@ def test_equal_means_are_near_in_the_metric_and_far_in_wasserstein():
 @pytest.mark.parametrize("weights", [[1.0, 2.0], [3.0, -1.0], [[1.0, 1.0]], [float("nan"), 1.0]])
 def test_weights_that_are_negative_or_not_of_mean_one_are_refused(weights):
     with pytest.raises(ValueError, match="of mean 1"):
-        dg.directional_metric(jnp.zeros(2), jnp.zeros(2), weights)
+        dg.directional_metric(jnp.zeros(2), jnp.zeros(2), jnp.array(weights))
 
 
 @pytest.mark.parametrize("p", [1.0, 2.0])
