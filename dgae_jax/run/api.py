@@ -1,10 +1,8 @@
 """Python API of runs: train one, load its policy."""
 
-import contextlib
 import dataclasses
 import shutil
 import tempfile
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, Literal, NamedTuple, Unpack
 
@@ -34,13 +32,7 @@ class Policy:
         self._quantiles = jax.jit(make_quantiles(env, config))
 
     def __call__(self, obs: Any) -> np.ndarray:
-        """Return the mean action, within the actuators' range, as evaluations play it.
-
-        Args:
-            obs: observations [..., O].
-
-        Returns:
-            Actions [..., A].
+        """Return the mean actions [..., A] for observations [..., O], as evaluations play them.
 
         Raises:
             ValueError: the last axis is not that of an observation.
@@ -48,13 +40,9 @@ class Policy:
         return self._apply(self._greedy, self._policy, obs)
 
     def quantiles(self, obs: Any) -> np.ndarray:
-        """Return the critic's quantiles of the discounted return, one for a scalar critic.
+        """Return the critic's quantiles [..., K] of the discounted return; a scalar critic has one.
 
-        Args:
-            obs: observations [..., O].
-
-        Returns:
-            Quantiles [..., K], of returns of scaled rewards with `normalize_rewards`.
+        With `normalize_rewards` they are of scaled rewards.
         """
         return self._apply(self._quantiles, self._critic, obs)
 
@@ -106,15 +94,20 @@ def train(
         RunError: the run ends early, by a signal too. The message says how to continue, from a
             directory that stays, even a temporary one.
     """
-    for name in options:
-        if name not in TrainOptions.__annotations__:
-            allowed = ", ".join(TrainOptions.__annotations__)
-            raise ConfigError(f"{name}: must be one of {allowed}")
-    with terminal.silenced(quiet), custom_env(env) as name, _directory(run_dir) as path:
-        config = config if name is None else dataclasses.replace(config, env=name)
-        done = training.train(resolve(config), RunOptions(run_dir=path, **options))
-        policy, rows = load_policy(path, env=env), metrics.read(path / "metrics.jsonl")
-        return Run(policy, rows, done.evaluation, None if run_dir is None else path)
+    path = Path(run_dir or tempfile.mkdtemp(prefix="dgae_jax-"))
+    directory = None if run_dir is None else path
+    try:
+        with terminal.silenced(quiet), custom_env(env) as name:
+            config = config if name is None else dataclasses.replace(config, env=name)
+            done = training.train(resolve(config), RunOptions(run_dir=path, **options))
+            policy, rows = load_policy(path, env=env), metrics.read(path / "metrics.jsonl")
+            return Run(policy, rows, done.evaluation, directory)
+    except RunError:
+        directory = path  # a run can continue there
+        raise
+    finally:
+        if directory is None:
+            shutil.rmtree(path, ignore_errors=True)
 
 
 def load_policy(
@@ -150,21 +143,3 @@ def load_policy(
         found = checkpoint.load_networks(source, config, which)
         policy, critic = jax.tree.map(lambda x: x[seed], (found.policy, found.critic))
         return Policy(policy, critic, config)
-
-
-@contextlib.contextmanager
-def _directory(run_dir: str | Path | None) -> Iterator[Path]:
-    """Yield `run_dir`, or a temporary directory that stays only if a run can continue in it."""
-    if run_dir is not None:
-        yield Path(run_dir)
-        return
-    made = tempfile.mkdtemp(prefix="dgae_jax-")
-    keep = False
-    try:
-        yield Path(made)
-    except RunError:
-        keep = True
-        raise
-    finally:
-        if not keep:
-            shutil.rmtree(made, ignore_errors=True)

@@ -1,27 +1,26 @@
 """Files of a run that grow: metrics, checkpoints, evaluations and the learning curve."""
 
 import gc
+import io
 import time
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import jax
 import numpy as np
 
 from dgae_jax.configs.resolved import ResolvedConfig
-from dgae_jax.learn.types import InferenceState, TrainState
+from dgae_jax.learn.build import policies_of
+from dgae_jax.learn.types import TrainState
 from dgae_jax.physics.engine import PhysicsState
-from dgae_jax.run import checkpoint, metrics, runtime, terminal
+from dgae_jax.run import checkpoint, files, metrics, runtime, terminal
 from dgae_jax.run.evaluation import evaluate_policies
 from dgae_jax.run.loggers import LoggerFeed
 from dgae_jax.run.metrics import EvaluationsFile, MetricsFile
 from dgae_jax.run.options import RunOptions
 from dgae_jax.run.runtime import Stopped, Watch
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 
 class RunLogger:
@@ -37,9 +36,9 @@ class RunLogger:
         self.metrics = MetricsFile(run_dir / "metrics.jsonl", config, done)
         self.evaluations = EvaluationsFile(run_dir / "evaluations.jsonl")
         self.evaluations.cut(done * config.samples_per_iteration, config.num_seeds)
-        names = options.log if runtime.is_first() else ()
+        names = options.log if jax.process_index() == 0 else ()
         self.feed = LoggerFeed(names, run_dir, config, self.steps)
-        self.page = terminal.Page(self.figure) if terminal.in_notebook() else None
+        self.page = terminal.Page(self.picture) if terminal.in_notebook() else None
         self.began = time.monotonic() - self.metrics.seconds
         self.thread, self.pending = ThreadPoolExecutor(1), Future()
         self.pending.set_result(None)
@@ -84,9 +83,10 @@ class RunLogger:
         directory, arrays = self.run_dir / "checkpoints", checkpoint.arrays_of(state)
         self._write(checkpoint.save, directory, self.config, arrays, self.steps, *keep)
 
-    def evaluate(self, policies: InferenceState, watch: Watch) -> dict[str, Any]:
+    def evaluate(self, state: TrainState, watch: Watch) -> dict[str, Any]:
         """Evaluate the policies and write and draw the result."""
         how = {"engine": self.options.eval_engine, "episodes": self.options.episodes}
+        policies = runtime.gather(policies_of(state))
         result = evaluate_policies(policies, self.config, **how, watch=watch)
         if not self.evaluated:
             self.pending.result()  # the checkpoint is on the disk before its evaluation
@@ -97,12 +97,13 @@ class RunLogger:
 
     def draw(self) -> None:
         """Write the learning curve so far."""
-        self._write(_plot, self.run_dir / "curve.png", *self._curve())
+        path, data = self.run_dir / "curve.png", self._curve()
+        self._write(lambda: files.replace(path, _png(data)))
 
-    def figure(self) -> "Figure | None":
-        """Return the learning curve so far, None before the first return."""
+    def picture(self, text: str) -> bytes | None:
+        """Return the learning curve so far with a text, None before the first return."""
         data = self._curve()
-        return None if np.isnan(data[1]).all() else metrics.learning_curve(*data)
+        return None if np.isnan(data[1]).all() else _png(data, text)
 
     def _curve(self) -> tuple[np.ndarray, np.ndarray, str, np.ndarray]:
         title = f"{self.config.task}, {self.config.algo}, {self.config.physics}"
@@ -122,6 +123,12 @@ class RunLogger:
         np.savez(path, env=envs, **arrays, action=action)
 
 
-def _plot(path: Path, *data) -> None:
-    metrics.save_figure(metrics.learning_curve(*data), path)
+def _png(data: tuple, text: str = "") -> bytes:
+    """Draw the learning curve, with a text below its title."""
+    figure = metrics.learning_curve(*data)
+    axes, image = figure.axes[0], io.BytesIO()
+    if text:
+        axes.set_title(f"{axes.get_title()}\n{text}", fontsize=9)
+    figure.savefig(image, format="png")
     gc.collect()  # a figure is full of cycles: 3 MB each
+    return image.getvalue()

@@ -1,7 +1,6 @@
 """Options of a run beside its configuration: where it is written, evaluated and shared."""
 
 import importlib.util
-import re
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypedDict
@@ -56,21 +55,15 @@ class RunOptions:
     """Metric loggers: tensorboard, wandb, mlflow; --log alone means none."""
 
     def __post_init__(self):
-        object.__setattr__(self, "log", tuple(self.log))  # a list, from Python or JSON
+        object.__setattr__(self, "log", tuple(dict.fromkeys(self.log)))  # perhaps a list
 
 
-class TrainOptions(TypedDict, total=False):
-    """Keyword options of `dgae_jax.train`: fields of `RunOptions`."""
+class SavedOptions(TypedDict, total=False):
+    """Options that a resumed run keeps."""
 
-    cache_dir: str
+    devices: int | None
     checkpoint_every: int
     keep_checkpoints: int
-    devices: int | None
-    coordinator: str | None
-    num_processes: int | None
-    process_id: int | None
-    resume_or_start: bool
-    inexact: bool
     max_nonfinite: int
     eval_engine: str | None
     episodes: int
@@ -78,10 +71,19 @@ class TrainOptions(TypedDict, total=False):
     log: tuple[str, ...]
 
 
+class TrainOptions(SavedOptions, total=False):
+    """Keyword options of `dgae_jax.train`: fields of `RunOptions`."""
+
+    cache_dir: str
+    coordinator: str | None
+    num_processes: int | None
+    process_id: int | None
+    resume_or_start: bool
+    inexact: bool
+
+
 INTEGER_RANGES = {
     "devices": (1, 100_000, "in one machine"),
-    "num_processes": (1, 100_000, "in one run"),
-    "process_id": (0, 99_999, "processes are counted from 0"),
     "checkpoint_every": (1, 2**31 - 1, "samples are counted in an int32"),
     "keep_checkpoints": (1, 1_000_000, "files in one directory"),
     "max_nonfinite": (1, 2**31 - 1, "iterations are counted in an int32"),
@@ -121,66 +123,31 @@ def validate_options(options: RunOptions, config: ResolvedConfig) -> None:
         if value is not None and not (type(value) is int and low <= value <= high):
             raise invalid(name, value, f"a whole number from {low:,} to {high:,} ({reason})")
     for name in options.log:
-        _validate_logger(name, options.log)
-    _validate_processes(options)
+        if name not in METRIC_LOGGERS:
+            raise invalid("log", name, f"one or more of {', '.join(METRIC_LOGGERS)}")
+        library = METRIC_LOGGERS[name]
+        spec = importlib.util.find_spec(library)
+        if spec is None or spec.origin is None:  # a folder of that name, such as wandb leaves
+            install = f'pip install "dgae_jax[{name}]"'
+            raise ConfigError(f"log {name}: {library} is missing; {install}", "log")
     if options.resume is not None and options.run_dir is not None:
         raise invalid("run_dir", options.run_dir, f"left out: --resume writes to {options.resume}")
-    if options.resume is not None and options.resume_or_start:
-        raise invalid("resume_or_start", True, "left out: --resume only resumes")
     if options.resume_or_start and options.run_dir is None:
         raise invalid("resume_or_start", True, "used with --run-dir DIR")
     if options.inexact and options.resume is None and not options.resume_or_start:
         raise invalid("inexact", True, "left out without --resume")
 
 
-def _validate_logger(name: str, names: tuple[str, ...]) -> None:
-    if name not in METRIC_LOGGERS:
-        raise invalid("log", name, f"one or more of {', '.join(METRIC_LOGGERS)}")
-    if names.count(name) > 1:
-        raise invalid("log", names, "each logger once")
-    package = METRIC_LOGGERS[name]
-    spec = importlib.util.find_spec(package)
-    if spec is None or spec.origin is None:  # a folder of that name, such as wandb leaves
-        install = f'pip install "dgae_jax[{name}]"'
-        raise ConfigError(f"log {name}: {package} is missing; {install}", "log")
-
-
-def _validate_processes(options: RunOptions) -> None:
-    if options.coordinator is not None:
-        if not re.fullmatch(r"[^\s:]+:\d{1,5}", options.coordinator):
-            raise invalid("coordinator", options.coordinator, "HOST:PORT")
-        for name in ("num_processes", "process_id"):
-            if getattr(options, name) is None:
-                raise invalid(name, None, "given with --coordinator")
-    elif options.process_id is not None or options.num_processes not in (None, 1):
-        name = "num_processes" if options.process_id is None else "process_id"
-        raise invalid(name, getattr(options, name), "left out without --coordinator")
-    if options.process_id is not None and options.process_id >= (options.num_processes or 0):
-        limit = f"below --num-processes {options.num_processes}"
-        raise invalid("process_id", options.process_id, limit)
-
-
-_SAVED = (
-    "devices",
-    "checkpoint_every",
-    "keep_checkpoints",
-    "max_nonfinite",
-    "eval_engine",
-    "episodes",
-    "debug_nonfinite",
-    "log",
-)
-
-
 def saved_options(options: RunOptions) -> dict[str, Any]:
     """Return the options that a resumed run keeps, as plain data for JSON."""
-    return {name: getattr(options, name) for name in _SAVED} | {"log": list(options.log)}
+    saved = {name: getattr(options, name) for name in SavedOptions.__annotations__}
+    return saved | {"log": list(options.log)}
 
 
 def read_options(data: Any) -> RunOptions:
     """Return the options that `saved_options` wrote; values of other types are left out."""
-    found = data if isinstance(data, dict) else {}
+    found: dict[str, Any] = data if isinstance(data, dict) else {}
     usual = saved_options(RunOptions(devices=1, eval_engine=""))
-    kept = {name: found[name] for name in _SAVED if type(found.get(name)) is type(usual[name])}
+    kept = {name: found[name] for name, x in usual.items() if type(found.get(name)) is type(x)}
     log = tuple(name for name in METRIC_LOGGERS if name in kept.get("log", []))
     return RunOptions(**{**kept, "log": log})

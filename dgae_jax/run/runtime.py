@@ -13,7 +13,7 @@ import tempfile
 import threading
 import time
 from collections.abc import Callable, Iterator
-from concurrent.futures import Future
+from concurrent.futures import ThreadPoolExecutor, wait
 from pathlib import Path
 from typing import Any
 
@@ -26,12 +26,11 @@ from dgae_jax.configs.resolved import ResolvedConfig
 from dgae_jax.envs.registry import spec_of
 from dgae_jax.learn.devices import divide_cpu
 from dgae_jax.physics import cores
-from dgae_jax.physics.registry import ENGINES
 from dgae_jax.run import terminal
 from dgae_jax.run.options import RunOptions
 
 Watch = Callable[[str], None]
-"""Called now and then with a line of progress; what it raises breaks the work off."""
+"""Called repeatedly with a line of progress; what it raises breaks the work off."""
 
 POLL_SECONDS = 0.5
 """Time between looks at the compiler."""
@@ -63,32 +62,22 @@ def compile_in_thread(
     """Compile a jitted function for these arguments, in a thread, while this one stays responsive.
 
     Python runs no signal handler while its main thread is inside XLA. A compiler that `watch`
-    breaks off keeps running, and aborts the end of the process unless that is `os._exit`.
+    breaks off keeps running; the end of the process waits for it unless that is `os._exit`.
     """
-    since, done = time.monotonic(), Future()
+    since = time.monotonic()
     watch(what)
     lowered = program.lower(*args)  # here: JAX's settings belong to a thread
-
-    def compile_lowered():
-        try:
-            done.set_result(lowered.compile())
-        except BaseException as reason:
-            done.set_exception(reason)
-
-    threading.Thread(target=compile_lowered, daemon=True, name=COMPILER_THREAD).start()
-    while True:
-        try:
-            done.result(POLL_SECONDS)
-            return
-        except TimeoutError:
-            if done.done():
-                raise
-            watch(f"{what}, {time.monotonic() - since:.0f} s")
+    thread = ThreadPoolExecutor(1, COMPILER_THREAD)
+    done = thread.submit(lowered.compile)
+    thread.shutdown(wait=False)
+    while wait([done], POLL_SECONDS).not_done:
+        watch(f"{what}, {time.monotonic() - since:.0f} s")
+    done.result()
 
 
 def is_compiling() -> bool:
     """Return whether a compiler that was broken off still runs."""
-    return any(t.name == COMPILER_THREAD and t.is_alive() for t in threading.enumerate())
+    return any(thread.name.startswith(COMPILER_THREAD) for thread in threading.enumerate())
 
 
 def join_processes(options: RunOptions) -> None:
@@ -97,16 +86,17 @@ def join_processes(options: RunOptions) -> None:
     Raises:
         ConfigError: they do not come.
     """
-    several = options.coordinator or _under_scheduler()
+    given = options.coordinator, options.num_processes, options.process_id
+    several = given != (None, None, None) or _under_scheduler()
     if jax.distributed.is_initialized() or options.num_processes == 1 or not several:
         return
     try:
-        jax.distributed.initialize(options.coordinator, options.num_processes, options.process_id)
-    except (RuntimeError, ValueError) as reason:
+        jax.distributed.initialize(*given)
+    except Exception as reason:  # of many kinds
         where = options.coordinator or "found by JAX"
         why = str(reason).partition("\n")[0][:300]
-        message = f"coordinator {where}: must be where all processes of the run meet ({why})"
-        raise ConfigError(message, "coordinator") from reason
+        must = f"must be HOST:PORT where all processes meet ({why})"
+        raise ConfigError(f"coordinator {where}: {must}", "coordinator") from reason
 
 
 def _under_scheduler() -> bool:
@@ -117,33 +107,17 @@ def _under_scheduler() -> bool:
     return any(int(size) > 1 for size in sizes) or pod or job
 
 
-def is_alone() -> bool:
-    """Return whether no other process shares the run."""
-    return jax.process_count() == 1
-
-
-def is_first() -> bool:
-    """Return whether this is the process that writes."""
-    return jax.process_index() == 0
-
-
-def of_first(value: int) -> int:
-    """Return the first process's value; every process must call."""
-    return value if is_alone() else int(multihost_utils.broadcast_one_to_all(np.int32(value)))
-
-
 def largest(value: int) -> int:
     """Return the largest value of any process; every process must call."""
-    return value if is_alone() else int(multihost_utils.process_allgather(np.int32(value)).max())
+    return int(multihost_utils.process_allgather(np.int32(value)).max())
 
 
 def gather(tree: Any) -> Any:
     """Return a tree's arrays on this host, also parts on other hosts; every process must call."""
 
     def one(x: Any) -> np.ndarray:
-        if isinstance(x, jax.Array) and not (x.is_fully_addressable or x.is_fully_replicated):
-            x = multihost_utils.process_allgather(x, tiled=True)
-        return np.asarray(x)
+        here = not isinstance(x, jax.Array) or x.is_fully_addressable
+        return np.asarray(x if here else multihost_utils.process_allgather(x, tiled=True))
 
     return jax.tree.map(one, tree)
 
@@ -151,25 +125,20 @@ def gather(tree: Any) -> Any:
 @contextlib.contextmanager
 def writing_directory(run_dir: Path) -> Iterator[Path]:
     """Yield the directory that this process writes: all but the first write a temporary copy."""
-    if is_first():
-        _barrier()
+    if jax.process_index() == 0:
+        multihost_utils.sync_global_devices("copied")
         yield run_dir
         return
     with tempfile.TemporaryDirectory(prefix="dgae_jax-") as scratch, terminal.silenced():
         copy = Path(scratch) / "run"
         if run_dir.exists():
             shutil.copytree(run_dir, copy)
-        _barrier()
+        multihost_utils.sync_global_devices("copied")
         yield copy
 
 
-def _barrier() -> None:
-    if not is_alone():
-        multihost_utils.sync_global_devices("dgae_jax")
-
-
 class Stopped(Exception):
-    """A signal arrived while nothing is lost by stopping at once."""
+    """A signal arrived where nothing is lost by stopping at once."""
 
 
 class Signals:
@@ -184,7 +153,6 @@ class Signals:
         self.received: signal.Signals | None = None
         self.agreed = False
         self.before: dict[signal.Signals, Any] = {}
-        self.nothing_to_lose = False
 
     def __enter__(self) -> "Signals":
         if threading.current_thread() is threading.main_thread():
@@ -197,24 +165,19 @@ class Signals:
         for kind, handler in self.before.items():
             signal.signal(kind, handler)
 
-    @contextlib.contextmanager
-    def may_stop(self, watch: Watch = unwatched) -> Iterator[Watch]:
-        """Raise `Stopped` if a signal has arrived; so does the watch that it yields, later.
+    def watching(self, watch: Watch = unwatched) -> Watch:
+        """Return a watch that raises `Stopped` once a signal has arrived.
 
-        The handler raises nothing: it may interrupt an import or a destructor. Of several
+        The handler itself raises nothing: it may interrupt an import or a destructor. Of several
         processes none can stop alone: there only a signal that all have agreed on counts.
         """
 
         def checked(text: str) -> None:
-            self._stop()
+            if self.received and (self.agreed or jax.process_count() == 1):
+                raise Stopped
             watch(text)
 
-        self.nothing_to_lose = is_alone() or self.agreed
-        try:
-            self._stop()
-            yield checked
-        finally:
-            self.nothing_to_lose = False
+        return checked
 
     def anywhere(self) -> bool:
         """Return whether any process of the run got a signal; every process must call."""
@@ -233,19 +196,13 @@ class Signals:
         """130 after SIGINT, 143 after SIGTERM, 129 after SIGHUP."""
         return 128 + (self.received or 0)
 
-    def _stop(self) -> None:
-        if self.received and self.nothing_to_lose:
-            raise Stopped
-
     def _record(self, kind: int, _) -> None:
         self.received = signal.Signals(kind)
         for each in self.before:
             signal.signal(each, signal.SIG_IGN if each == signal.SIGHUP else signal.SIG_DFL)
-        if self.nothing_to_lose:
-            return
-        text = "finishing the running dispatch, then saving; a second signal ends the run at once"
+        text = f"{self.name}: stopping; a second signal ends the process at once\n"
         with contextlib.suppress(OSError):  # no print: it may be what was interrupted
-            os.write(2, f"{self.name}: {text}\n".encode())
+            os.write(2, text.encode())
 
 
 def use_devices(config: ResolvedConfig, options: RunOptions) -> int:
@@ -255,7 +212,11 @@ def use_devices(config: ResolvedConfig, options: RunOptions) -> int:
         ConfigError: the devices do not exist, or do not divide the envs or the seeds.
     """
     join_processes(options)
-    wanted = _requested(config, options)
+    wanted = options.devices
+    if spec_of(config.env).on_host:
+        if wanted not in (None, 1) or jax.distributed.is_initialized():
+            raise invalid("devices", wanted, f"1, in one process, with {config.env}")
+        wanted = 1
     with contextlib.suppress(RuntimeError):  # JAX runs already, and has the devices that it has
         divide_cpu(wanted or _dividing(config, cores(), ENVS_PER_CORE))
     _start_jax(config)
@@ -263,11 +224,9 @@ def use_devices(config: ResolvedConfig, options: RunOptions) -> int:
     if wanted is None and processes == 1:
         return _dividing(config, there, ENVS_PER_CORE if jax.default_backend() == "cpu" else 1)
     count = wanted or there
-    if count > there:
-        limit = f"at most {there}, which JAX has here (a CPU is divided before JAX starts)"
+    if count > there or (count < there and processes > 1):
+        limit = f"at most {there}, which JAX has started with, and all with several processes"
         raise invalid("devices", count, limit)
-    if count < there and processes > 1:
-        raise invalid("devices", count, f"left out: each of several processes uses all {there}")
     if _dividing(config, count * processes, 1) != count * processes:
         sizes = f"num_envs {config.num_envs} or num_seeds {config.num_seeds}"
         many = f" in each of {processes} processes" if processes > 1 else ""
@@ -275,24 +234,13 @@ def use_devices(config: ResolvedConfig, options: RunOptions) -> int:
     return count
 
 
-def _requested(config: ResolvedConfig, options: RunOptions) -> int | None:
-    """Return the number of devices asked for; envs on the host have one."""
-    if not spec_of(config.env).on_host:
-        return options.devices
-    for name, value in (("devices", options.devices), ("num_processes", jax.process_count())):
-        if value not in (None, 1):
-            raise invalid(name, value, f"1 with {config.env}, which is stepped in one process")
-    return 1
-
-
 def _dividing(config: ResolvedConfig, most: int, envs_each: int) -> int:
     """Return the largest number of devices up to `most` that divides seeds or envs evenly."""
-
-    def fits(count: int) -> bool:
+    for count in range(most, 1, -1):
         seeds = config.num_seeds > 1 and config.num_seeds % count == 0
-        return seeds or (config.num_envs % count == 0 and config.num_envs >= count * envs_each)
-
-    return next((count for count in range(most, 1, -1) if fits(count)), 1)
+        if seeds or (config.num_envs % count == 0 and config.num_envs >= count * envs_each):
+            return count
+    return 1
 
 
 def _start_jax(config: ResolvedConfig) -> None:
@@ -300,17 +248,11 @@ def _start_jax(config: ResolvedConfig) -> None:
     try:
         kind = jax.devices()[0].platform
     except Exception as reason:  # of many kinds; an empty AssertionError for a missing plugin
-        why = str(reason) or type(reason).__name__
-        gpu = "" if wanted == "cpu" else 'an NVIDIA GPU needs pip install "dgae_jax[cuda13]"; '
-        must = "must name a device that JAX finds here, cpu for one"
-        raise ConfigError(f"JAX_PLATFORMS={wanted}: {must}; {gpu}JAX says: {why}") from reason
+        why = f"must name a device that JAX finds here ({str(reason) or type(reason).__name__})"
+        gpu = 'an NVIDIA GPU needs pip install "dgae_jax[cuda13]"'
+        raise ConfigError(f"JAX_PLATFORMS={wanted}: {why}; {gpu}") from reason
     if spec_of(config.env).on_host and kind != "cpu":
         raise ConfigError(f"JAX_PLATFORMS={wanted}: must be cpu with {config.env}, not {kind}")
-    if kind != "cpu" and config.physics in ENGINES and ENGINES[config.physics].on_host:
-        terminal.warn(
-            f"warning: --physics {config.physics} simulates on the CPU, everything else runs on"
-            f" the {kind}; --physics jax or JAX_PLATFORMS=cpu avoids the transfers"
-        )
 
 
 def use_cache(cache_dir: str) -> None:
@@ -347,11 +289,11 @@ def _device_model() -> str:
     """Return the model; JAX has one name for all CPUs, but compiles for the one it finds."""
     if jax.default_backend() != "cpu":
         return jax.devices()[0].device_kind
-    try:
-        lines = Path("/proc/cpuinfo").read_text().splitlines()
-        return next(x.partition(":")[2].strip() for x in lines if x.startswith("model name"))
-    except (OSError, StopIteration):
-        return platform.processor() or platform.machine()
+    with contextlib.suppress(OSError):
+        for line in Path("/proc/cpuinfo").read_text().splitlines():
+            if line.startswith("model name"):
+                return line.partition(":")[2].strip()
+    return platform.processor() or platform.machine()
 
 
 def available_memory() -> int:

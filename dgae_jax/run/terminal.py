@@ -3,25 +3,21 @@
 A failed write costs a line, never the run. This module imports nothing of the package.
 """
 
-import base64
 import contextlib
-import gc
+import datetime
 import io
 import os
 import sys
 import time
 from collections.abc import Callable, Iterator
 from contextvars import ContextVar
-from typing import TYPE_CHECKING, Any, TextIO
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
+from typing import Any, TextIO
 
 LINE_SECONDS = 10.0
 """Time between progress lines where there is no terminal."""
 
 PICTURE_SECONDS = 4.0
-"""Least time between two pictures in a notebook; drawing takes at most a tenth of the time."""
+"""Least time between two pictures in a notebook."""
 
 PICTURE_WIDTH = 640
 """Width of a picture in a notebook [CSS pixels]."""
@@ -33,19 +29,12 @@ def prepare() -> None:
     """Make the standard streams harmless; the first thing that a command does.
 
     Closed streams (`>&-`) are opened on /dev/null, so that no file of the run takes their place.
-    Characters that the encoding lacks are escaped.
     """
-    for descriptor in (0, 1, 2):
-        try:
-            os.fstat(descriptor)
-        except OSError:  # the lowest free number is this one
-            os.set_inheritable(os.open(os.devnull, os.O_RDWR), True)
-    for name in ("stdout", "stderr"):
-        stream: Any = getattr(sys, name)
-        if stream is None:
-            setattr(sys, name, open(os.devnull, "w"))  # noqa: PTH123, SIM115
-        elif hasattr(stream, "reconfigure"):
-            stream.reconfigure(errors="backslashreplace")
+    for name, mode in (("stdin", "r"), ("stdout", "w"), ("stderr", "w")):
+        if getattr(sys, name) is None:  # the lowest free number is that of this stream
+            nothing = os.open(os.devnull, os.O_RDWR)
+            os.set_inheritable(nothing, True)
+            setattr(sys, name, open(nothing, mode))  # noqa: PTH123, SIM115
 
 
 def say(text: str) -> None:
@@ -93,8 +82,8 @@ def write(stream: TextIO | None, text: str) -> None:
         try:
             stream.write(text)
         except UnicodeEncodeError:
-            encoding = stream.encoding or "ascii"
-            stream.write(text.encode(encoding, "backslashreplace").decode(encoding))
+            escaped = text.encode(stream.encoding, "backslashreplace")
+            stream.write(escaped.decode(stream.encoding))
         stream.flush()
     except (OSError, ValueError):  # no reader, a full disk, a closed stream
         with contextlib.suppress(OSError, ValueError, AttributeError):
@@ -124,40 +113,25 @@ class Steady(io.StringIO):
 
 
 class Page:
-    """One output of a notebook cell, replaced as the run goes on: text, later the curve."""
+    """One output of a notebook cell, replaced while the run continues: text, later the curve."""
 
-    def __init__(self, draw: "Callable[[], Figure | None]"):
-        """Keep `draw`, which returns the figure as it is now, None before the first return."""
+    def __init__(self, draw: Callable[[str], bytes | None]):
+        """Keep `draw`, which returns a PNG with a text; None before there is anything to draw."""
         self.draw, self.shown, self.due = draw, None, 0.0
 
     def show(self, text: str, at_once: bool = False) -> None:
         """Replace what is shown, unless it was replaced a moment ago."""
-        from IPython.display import display
+        from IPython.display import Image, Pretty, display
 
-        began = time.monotonic()
-        if began < self.due and not at_once:
+        if time.monotonic() < self.due and not at_once:
             return
-        figure = self.draw()
-        data, metadata = ({"text/plain": text}, {}) if figure is None else _picture(figure, text)
+        png = self.draw(text)
+        output = Pretty(text) if png is None else Image(png, width=PICTURE_WIDTH)
         if self.shown is None:
-            self.shown = display(data, raw=True, metadata=metadata, display_id=True)
+            self.shown = display(output, display_id=True)
         else:
-            self.shown.update(data, raw=True, metadata=metadata)
-        ended = time.monotonic()
-        self.due = ended + max(PICTURE_SECONDS, 9 * (ended - began))
-
-
-def _picture(figure: "Figure", text: str) -> tuple[dict[str, Any], dict[str, Any]]:
-    axes = figure.axes[0]
-    title = axes.get_title()
-    if text:
-        axes.set_title(f"{title}\n{text}", fontsize=9)
-    image = io.BytesIO()
-    figure.savefig(image, format="png")
-    gc.collect()  # a figure is full of cycles: 3 MB each
-    png = base64.b64encode(image.getvalue()).decode()
-    data = {"image/png": png, "text/plain": f"{title} {text}".strip()}
-    return data, {"image/png": {"width": PICTURE_WIDTH}}
+            self.shown.update(output)
+        self.due = time.monotonic() + PICTURE_SECONDS
 
 
 class Reporter:
@@ -166,7 +140,7 @@ class Reporter:
     def __init__(self, total: int = 0, runs: int = 1, page: Page | None = None):
         """Report on `total` samples of each of `runs` seeds; `page` takes the place of lines."""
         self.total, self.runs, self.page = total, runs, page
-        self.printed = time.monotonic()
+        self.due = time.monotonic() + LINE_SECONDS
         self.bar = None
         if is_live():
             from rich.console import Console
@@ -188,39 +162,29 @@ class Reporter:
         if self.page and kind is None:
             self.page.show("", at_once=True)
 
-    def announce(self, text: str) -> None:
-        """Show a line at once; the bar has it already."""
-        if self.page:
-            self.page.show(text, at_once=True)
-        elif not self.bar:
-            self.printed = time.monotonic()
-            say(text)
-
-    def watch(self, text: str) -> None:
-        """Show what is going on: in the bar, or a line every ten seconds."""
+    def watch(self, text: str, at_once: bool = False) -> None:
+        """Show what is going on: in the bar or page, or a line every ten seconds."""
         if self.page:
             self.page.show(text)
         elif self.bar:
             self.bar.update(self.task, description=text)
-        elif time.monotonic() - self.printed >= LINE_SECONDS:
-            self.announce(text)
+        elif at_once or time.monotonic() >= self.due:
+            self.due = time.monotonic() + LINE_SECONDS
+            say(text)
 
     def update(self, steps: int, speed: float, mean_return: float | None) -> None:
         """Show samples done, samples per second of one run, mean return and time left."""
-        left = (self.total - steps) / speed
+        done, left = f"{steps:,} of {self.total:,} steps", clock((self.total - steps) / speed)
         shown = "–" if mean_return is None else f"{mean_return:,.1f}"
-        done = f"{steps:,}/{self.total:,}" if self.bar else f"{steps:,} of {self.total:,} steps"
-        text = f"{done}  {speed * self.runs:,.0f} steps/s  return {shown}  {clock(left)} left"
+        text = f"{done}  {speed * self.runs:,.0f} steps/s  return {shown}  {left} left"
         if self.bar:
             self.bar.update(self.task, completed=steps)
-        (self.announce if steps >= self.total and not self.bar else self.watch)(text)
+        self.watch(text, at_once=steps >= self.total)
 
 
 def clock(seconds: float) -> str:
-    """Return hours, minutes and seconds as text."""
-    minutes, rest = divmod(round(seconds), 60)
-    hours, minutes = divmod(minutes, 60)
-    return f"{hours}:{minutes:02d}:{rest:02d}"
+    """Return days, hours, minutes and seconds as text."""
+    return str(datetime.timedelta(seconds=round(seconds)))
 
 
 def counted(number: int, noun: str) -> str:

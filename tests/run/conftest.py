@@ -26,11 +26,19 @@ def state():
     return make_trainer(make_task(SMALL), 1).init(SMALL, seed_keys(SMALL))
 
 
+def trained(run_dir, config):
+    assert train_command(config, dataclasses.replace(QUIET, run_dir=run_dir)) == 0
+    return run_dir
+
+
 @pytest.fixture(scope="session")
 def finished(tmp_path_factory):
-    run_dir = tmp_path_factory.mktemp("runs") / "finished"
-    assert train_command(small(), dataclasses.replace(QUIET, run_dir=run_dir)) == 0
-    return run_dir
+    return trained(tmp_path_factory.mktemp("runs") / "finished", small())
+
+
+@pytest.fixture(scope="session")
+def three_seeds(tmp_path_factory):
+    return trained(tmp_path_factory.mktemp("runs") / "three", small("a2c", seeds=3))
 
 
 @pytest.fixture
