@@ -1,11 +1,11 @@
 """One run from its configuration to its evaluation, on disk: started or resumed."""
 
 import contextlib
-import dataclasses
 import os
 import re
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -79,8 +79,7 @@ def train(
     if options.resume_or_start and options.run_dir:
         runtime.join_processes(options)
         if runtime.largest(directory.has_begun(options.run_dir)):
-            run_dir, options = options.run_dir, dataclasses.replace(options, run_dir=None)
-            options = dataclasses.replace(options, resume=run_dir, resume_or_start=False)
+            options = replace(options, resume=options.run_dir, run_dir=None, resume_or_start=False)
     options = prepare(config, options)
     if options.resume is not None:
         _check_resumable(config, options.resume, options)
@@ -135,7 +134,7 @@ def prepare(config: ResolvedConfig, options: RunOptions) -> RunOptions:
     devices = runtime.use_devices(config, options)
     runtime.use_cache(options.cache_dir)
     check_memory(config, make_task(config), runtime.available_memory())
-    return dataclasses.replace(options, devices=devices)
+    return replace(options, devices=devices)
 
 
 def _check_resumable(config: ResolvedConfig, run_dir: Path, options: RunOptions) -> None:
