@@ -113,7 +113,7 @@ class Steady(io.StringIO):
 
 
 class Page:
-    """One output of a notebook cell, replaced while the run continues: text, later the curve."""
+    """One output in a notebook, replaced while the run continues: text, later the curve."""
 
     def __init__(self, draw: Callable[[str], bytes | None]):
         """Keep `draw`, which returns a PNG with a text; None before there is anything to draw."""
