@@ -13,21 +13,21 @@ PPO = resolve(Config(algo="ppo", physics="native"))
 
 
 @pytest.mark.parametrize(
-    ("word", "kind", "ends", "options"),
+    ("word", "kind", "ends", "is_log"),
     [
-        ("gamma=0.9:0.999", "float", (0.9, 0.999), {"log": False}),
-        ("policy.learning-rate=log:1e-4:1e-2", "float", (1e-4, 1e-2), {"log": True}),
-        ("num_envs=int:4:64", "int", (4, 64), {"log": False}),
-        ("policy.epochs=int:log:1:20", "int", (1, 20), {"log": True}),
-        ("critic.minibatches=16,32,64", "categorical", (16, 32, 64), {}),
-        ("normalize_rewards=true,false", "categorical", (True, False), {}),
-        ("policy.hidden=64x64,256", "categorical", ("64x64", 256), {}),
+        ("gamma=0.9:0.999", "float", (0.9, 0.999), False),
+        ("policy.learning-rate=log:1e-4:1e-2", "float", (1e-4, 1e-2), True),
+        ("num_envs=int:4:64", "int", (4, 64), False),
+        ("policy.epochs=int:log:1:20", "int", (1, 20), True),
+        ("critic.minibatches=16,32,64", "categorical", (16, 32, 64), False),
+        ("normalize_rewards=true,false", "categorical", (True, False), False),
+        ("policy.hidden=64x64,256", "categorical", ("64x64", 256), False),
     ],
 )
-def test_a_word_becomes_values_that_optuna_suggests(word, kind, ends, options):
+def test_a_word_becomes_values_that_optuna_suggests(word, kind, ends, is_log):
     ((path, found),) = space_of([word], PPO).items()
     assert path == word.partition("=")[0].replace("-", "_")
-    assert (found.kind, found.ends, found.options) == (kind, ends, options)
+    assert (found.kind, found.ends, found.is_log) == (kind, ends, is_log)
     assert found.suggest(FixedTrial({path: ends[1]}), path) == ends[1]
 
 

@@ -96,7 +96,8 @@ def test_another_tuning_in_the_same_study_is_refused(tmp_path, changes, message)
 def test_a_run_that_stops_is_retried_where_it_was(tmp_path, monkeypatch):
     ours = tuning(tmp_path)
     study = open_study(ours)
-    study.ask({})  # by a process that was lost before its first heartbeat
+    with pytest.warns(UserWarning, match="Heartbeat"):
+        study.ask({})  # by a process that was lost before its first heartbeat
     train, directories = tune.training.train, []
 
     def stopped_at_first(config, options, on_eval):
