@@ -77,6 +77,7 @@ def test_signal_raises_run_error_with_directory(tmp_path, monkeypatch):
     honest = logger.evaluate_policies
 
     def interrupted(*args, **how):
+        monkeypatch.setattr(logger, "evaluate_policies", honest)
         signal.raise_signal(signal.SIGTERM)
         return honest(*args, **how)
 
