@@ -98,6 +98,8 @@ def _kinds(args: Arguments) -> dict[str, Variant]:
     given = args.train.settings
     if args.variants is None:
         return {algo: (algo, {}) for algo in args.algos}
+    if args.algos != Arguments.algos:
+        raise invalid("algos", args.algos, "left out with --variants, each of which has its own")
     kinds = variants(args.variants)
     for path in {path for _, changes in kinds.values() for path in changes}:
         if given.get(path) != TRAIN.settings.get(path):

@@ -11,7 +11,7 @@ import tyro
 from dgae_jax.cli import parse
 from dgae_jax.cli.train import DEFAULTS, check_of_many, configure
 from dgae_jax.cli.train import Arguments as TrainArguments
-from dgae_jax.configs.config import ConfigError
+from dgae_jax.configs.config import ConfigError, flag
 from dgae_jax.physics import cores
 
 if TYPE_CHECKING:
@@ -48,6 +48,9 @@ def parsed(argv: list[str]) -> "Tuning":
     """Return the tuning of a command line; raise ConfigError for the first mistake."""
     args = parse.peek(Arguments, argv) or parse.arguments(Arguments, argv)
     check_of_many(args.train)
+    for name in ("checkpoint_every", "keep_checkpoints", "inexact"):
+        if getattr(args.train.run, name) != getattr(DEFAULTS.run, name):
+            raise ConfigError(f"{flag(name)}: must be left out: a trial is judged at each quarter")
     config, options = configure(
         args.train,
         lambda start: (

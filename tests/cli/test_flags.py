@@ -68,6 +68,11 @@ def test_names_and_numbers_of_other_trainers_are_understood(words, setting, valu
         ("reproduce x --scale 1e-4", "--total-steps 100: must be at least one iteration"),
         ("reproduce x --variants risk --lam 0", "--gae-lambda 0.0: must be left out with"),
         ("tune --seed 1", "--seed: must be left out: there are many runs"),
+        ("tune --keep-checkpoints 1", "--keep-checkpoints: must be left out: a trial"),
+        (
+            "reproduce x --variants risk --algos ppo",
+            "--algos ppo: must be left out with --variants",
+        ),
         ("tune --storage mysql://me:secret@x/y", "error: --storage: must be postgresql://"),
         ("--completion csh", "error: Shell should be one"),
         ("trian", "Available subcommands: train, evaluate"),
