@@ -38,12 +38,11 @@ class Shared(FitConfig):
     hidden: tuple[int, ...] | None = None  # pyright: ignore[reportIncompatibleVariableOverride]
     """Width of each hidden layer [units]."""
 
-    def apply(self, config: Config, start: Config) -> Config:
-        """Return `config` with these settings where it uses them and has the value of `start`."""
+    def apply(self, config: Config) -> Config:
+        """Return `config` with these settings where it uses them."""
         for name, value in vars(self).items():
             for path in (f"policy.{name}", f"critic.{name}"):
-                is_usual = config.get(path) == start.get(path) is not None
-                if value is not None and is_usual:
+                if value is not None and config.get(path) is not None:
                     config = config.replace(**{path: value})
         return config
 

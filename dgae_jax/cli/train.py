@@ -64,11 +64,11 @@ def configure(
     """Parse a command line over the settings where it starts, which `given` names, and check it."""
     resume, file = given.run.resume, given.run.resume or given.config
     options = directory.saved_options(resume) if resume else RunOptions()
-    start = _start(given)
+    start = given.shared.apply(_start(given))
     found = parse_over(Arguments(settings=start, run=options))
     if file and found.settings.algo != start.algo:
         raise invalid("algo", found.settings.algo, f"{start.algo} as in {file}, or left out")
-    config = resolve(found.shared.apply(found.settings, start))
+    config = resolve(found.settings)
     validate_options(found.run, config)
     return config, found.run
 

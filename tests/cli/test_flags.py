@@ -39,6 +39,7 @@ def test_flags_start_from_the_preset_of_task_and_algorithm():
         ("--lr 1e-3", "policy.options", {"learning_rate": 1e-3}),
         ("--lr 1e-3 --policy.learning-rate 1e-4", "policy.options", {"learning_rate": 1e-4}),
         ("--algo Trpo --update-epochs 3", "critic.fit", {"epochs": 3}),
+        ("--epochs 5 --policy.epochs 10", "policy.options", {"epochs": 10}),
         ("--hidden-sizes 8 16", "policy.hidden", (8, 16)),
         ("--env Walker2d", "env", "walker2d"),
     ],

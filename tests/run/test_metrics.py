@@ -108,7 +108,7 @@ def test_checkpoint_is_on_disk_before_its_evaluation(state, tmp_path, monkeypatc
     monkeypatch.setattr(logger, "evaluate_policies", lambda *_, **__: evaluation)
     with RunLogger(tmp_path, SMALL, RunOptions(), 0) as run:
         run.save(state)
-        run.evaluate(None, print)
+        run.evaluate(state, print)
     assert seen == [b""]
     assert [row["return_mean"] for row in run.evaluations.rows] == [1.0]
 
