@@ -32,8 +32,7 @@ Written by `python -m docs.site.configuration` from the dataclasses.
 A setting's path is its flag: `config.replace(**{"policy.clip_eps": 0.3})` is
 `--policy.clip-eps 0.3`; booleans are `--name` or `--no-name`. Settings start from `--preset tuned`
 or `paper`, from `--config FILE` or, in Python, from `dgae_jax.Config()`. *Unset* ones are filled
-in; one without effect is an error. Former names (`horizon`, `lam`, `policy.clip`, `policy.radius`,
-`policy.backtracks`) are still read.
+in; one without effect is an error. Former names are still read.
 """
 
 
