@@ -61,7 +61,8 @@ def critics(rows: list[dict]) -> str:
 
 def speeds(found: dict) -> str:
     """Return a row per algorithm and engine, then every peer in its fastest layout."""
-    lines = ["| | compile | steps/s | over the peer | of the roofline |", "|---|---|---|---|---|"]
+    columns = "compile | steps/s | over the peer | share of the roofline | roofline over the peer"
+    lines = [f"| | {columns} |", "|---|---|---|---|---|---|"]
     tasks = {(row["task"], row["width"]) for row in found["ours"]}
     for row in found["ours"]:
         rival, speed = rival_of(row, found["peers"]), row["steps_per_second"]
@@ -71,7 +72,7 @@ def speeds(found: dict) -> str:
         )
         where = f", {row['task'].title()}, 2 × {row['width']}" if len(tasks) > 1 else ""
         name = f"{row['algo'].upper()}, `{row['physics']}`{where}"
-        share = f"{speed / row['roofline']:.2f} of {most}"
+        share = f"{speed / row['roofline']:.2f} | {most}"
         lines.append(
             f"| {name} | {row['compile_seconds']:.1f} s | {speed:,.0f} | {over} | {share} |"
         )
@@ -79,7 +80,10 @@ def speeds(found: dict) -> str:
     for peer in sorted(found["peers"], key=itemgetter("steps_per_second")):
         fastest[peer["name"].split()[0], peer["task"], peer["width"], peer["algo"]] = peer
     for peer in fastest.values():
-        lines.append(f"| {peer['name']} | – | {peer['steps_per_second']:,.0f} | – | – |")
+        name = peer["name"].replace(", 1 threads", ", 1 thread")
+        if peer["algo"] == "TRPO":
+            name = name.replace("stable-baselines3", "sb3-contrib")
+        lines.append(f"| {name} | – | {peer['steps_per_second']:,.0f} | – | – | – |")
     return "\n".join(lines)
 
 

@@ -3,12 +3,13 @@
     python examples/dppo.py --total-steps 1000000 --seed 0
 
 DPPO differs from PPO in three places, marked (1) to (3): the critic predicts K quantiles of the
-return, the advantage sums distributional TD errors, and the critic is fitted to samples of the
-return distribution by the quantile-Huber loss.
+return, the advantage sums distributional TD errors and the targets are samples of the return
+distribution, and the loss is the quantile-Huber loss.
 
-This file computes what `dgae_jax.train(dgae_jax.preset("tuned", "dppo", "hopper"))` computes, with
-the same random keys. It leaves out what does not change these numbers: masks for environments that
-turn non-finite, bounds on outliers in the running statistics, several devices, and files.
+This file computes what `dgae_jax.train(dgae_jax.preset("tuned", "dppo", "hopper"))` computes, up to
+rounding, with the same random keys. It leaves out what does not change these numbers: masks for
+environments that turn non-finite, bounds on outliers in the running statistics, several devices,
+and files.
 """
 
 from dataclasses import dataclass

@@ -76,8 +76,8 @@ class RenderArguments(PolicyArguments):
 def render(args: RenderArguments) -> None:
     """Make a video of one run or several."""
     if args.during and (args.compare or args.checkpoint == "best" or args.run_dir.is_file()):
-        allowed = "left out with --compare, --checkpoint best and the file of a single policy"
-        raise ConfigError(f"--during: must be {allowed}")
+        others = "--compare, --checkpoint best or the file of a single policy"
+        raise ConfigError(f"--during: cannot be combined with {others}")
     encoding.check_installed()
     sources = [args.run_dir, *args.compare]
     if any(path.is_file() for path in sources):

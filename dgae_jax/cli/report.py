@@ -1,4 +1,4 @@
-"""Report on sweeps: `dgae report STUDY …`."""
+"""Report on sweeps: `dgae report SWEEP …`."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,27 +18,28 @@ from dgae_jax.run import terminal
 class Arguments:
     """Write figures, tables and one page of HTML from the results of sweeps."""
 
-    studies: tyro.conf.Positional[tuple[Path, ...]]
+    sweeps: tyro.conf.Positional[tuple[Path, ...]]
     """Directories of sweeps, or files of results; several are compared with the first [paths]."""
     out: Path | None = None
     """Directory to write to; by default report in the directory of the first sweep [path]."""
     published: bool = False
     """Mark results that others have published in the learning curves."""
     videos: bool = False
-    """Show a video per task, of the median seed of the best algorithm, kept in STUDY/videos."""
+    """Show a video per task, of the median seed of the best algorithm, kept in SWEEP/videos."""
     markdown: Path | None = None
     """A file in which tables between `<!-- dgae report: NAME -->` and `<!-- /dgae report -->` are
-    replaced; `NAME of STUDY` is a table that only a report on that sweep replaces [path]."""
+    replaced; `NAME of SWEEP` is a table that only a report on that sweep replaces [path]."""
 
 
 @parse.command(Arguments)
 def report(args: Arguments) -> None:
     """Write a report, after everything that can be wrong was checked."""
-    if not args.studies:
-        raise ConfigError("STUDIES: must be the directory of one sweep or more")
-    if args.markdown and len(args.studies) > 1:
-        raise invalid("markdown", args.markdown, "left out where several sweeps are compared")
-    sweeps = [results.read(path) for path in args.studies]
+    if not args.sweeps:
+        raise ConfigError("SWEEPS: must be the directory of one sweep or more")
+    if args.markdown and len(args.sweeps) > 1:
+        both = f"markdown {args.markdown}: cannot be combined with several sweeps"
+        raise ConfigError(both, "markdown")
+    sweeps = [results.read(path) for path in args.sweeps]
     out = args.out or sweeps[0].directory / "report"
     published = results.published() if args.published else []
     from dgae_jax.report import groups, markdown, page

@@ -1,4 +1,4 @@
-"""Train a sweep: `dgae reproduce studies/paper --preset paper --scale 0.1`."""
+"""Train a sweep: `dgae reproduce runs/sweep --preset paper --scale 0.1`."""
 
 import dataclasses
 import shlex
@@ -33,7 +33,7 @@ class Arguments:
     sweep that was stopped.
     """
 
-    study: tyro.conf.Positional[Path]
+    sweep: tyro.conf.Positional[Path]
     """Directory of the sweep, new or to be resumed [path]."""
     envs: tuple[str, ...] = tuple(TASKS)
     """Tasks."""
@@ -89,7 +89,7 @@ def _check(args: Arguments) -> None:
         if Config(env=env).env != env:
             raise invalid("envs", env, "in lower case; --env-version says which version")
     if args.train.settings.env or args.train.settings.algo:
-        raise ConfigError("--env, --algo: must be left out; a sweep has --envs and --algos")
+        raise ConfigError("--env, --algo: a sweep has --envs and --algos instead")
     check_of_many(args.train)
 
 
@@ -99,12 +99,13 @@ def _kinds(args: Arguments) -> dict[str, Variant]:
     if args.variants is None:
         return {algo: (algo, {}) for algo in args.algos}
     if args.algos != Arguments.algos:
-        raise invalid("algos", args.algos, "left out with --variants, each of which has its own")
+        shown = " ".join(args.algos)
+        raise ConfigError(f"algos {shown}: cannot be combined with --variants", "algos")
     kinds = variants(args.variants)
     for path in {path for _, changes in kinds.values() for path in changes}:
         if given.get(path) != TRAIN.settings.get(path):
-            allowed = f"left out with --variants {args.variants}, which set it"
-            raise invalid(path, given.get(path), allowed)
+            both = f"cannot be combined with --variants {args.variants}, which set it"
+            raise ConfigError(f"{path} {given.get(path)}: {both}", path)
     return kinds
 
 
@@ -114,7 +115,7 @@ def reproduce(sweep: Sweep) -> int:
     args, runs, options = sweep
     launch = launcher(args.launch)
     line = shlex.join(["dgae", "reproduce", *sys.argv[1:]])
-    with sweeps.opened(args.study, runs, line) as opened:
+    with sweeps.opened(args.sweep, runs, line) as opened:
         from dgae_jax.study import reproduce
 
         return reproduce.reproduce(opened, runs, options, launch)

@@ -49,7 +49,7 @@ def check_of_many(given: Arguments) -> None:
     for name in OF_ONE_RUN:
         part = "run" if hasattr(given.run, name) else "settings"
         if getattr(getattr(given, part), name) != getattr(getattr(DEFAULTS, part), name):
-            raise ConfigError(f"{flag(name)}: must be left out: there are many runs")
+            raise ConfigError(f"{flag(name)}: cannot be combined with many runs")
 
 
 def parsed(argv: list[str]) -> tuple[ResolvedConfig, RunOptions]:
@@ -78,7 +78,7 @@ def _start(given: Arguments) -> Config:
     resume, file, ours = given.run.resume, given.config, given.settings
     for name, value, other in (("preset", given.preset, resume or file), ("config", file, resume)):
         if value and other:
-            raise invalid(name, value, f"left out: all settings start from {other}")
+            raise ConfigError(f"{name} {value}: cannot be combined with {other}", name)
     if resume:
         return directory.read_config(resume).as_config()
     if file:

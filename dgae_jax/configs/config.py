@@ -84,7 +84,7 @@ class FitConfig(Settings):
     """Learning rate at the start [1]."""
     learning_rate_end: float | None = None
     """Learning rate at the end as a fraction of the start: 1 constant, 0 linear decay to zero.
-    A trust region's max_kl decays so over the last fifth of the run [1]."""
+    With a trust region it is max_kl that decays, during the last fifth of the run [1]."""
     epochs: int | None = None
     """Passes over each rollout [1]."""
     minibatches: int | None = None
@@ -125,7 +125,8 @@ class CriticConfig(FitConfig):
     """scalar (one value), quantile (a distribution), sorted (quantiles sorted after the network)
     or ordered (quantiles that cannot cross); unset: the algorithm's own."""
     target: TargetName | None = None
-    """Target of the fit; unset: the algorithm's own."""
+    """What the critic is fitted to: bellman, bellman-frozen, lambda-shift, sr-lambda, lambda-return
+    or monte-carlo (algorithms.md#critic-targets); unset: the algorithm's own."""
     quantiles: int | None = None
     """Quantiles K of a distributional critic [1]."""
     kappa: float | None = None

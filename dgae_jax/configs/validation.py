@@ -45,7 +45,7 @@ RANGES: dict[str, tuple[float, float, str]] = {
     "policy.clip_eps": POSITIVE,
     "policy.max_kl": POSITIVE,
     "policy.damping": POSITIVE,
-    "policy.cg_iterations": _whole(1, 1000, "in float32 it loses orthogonality before"),
+    "policy.cg_iterations": _whole(1, 1000, "float32 directions are not conjugate beyond"),
     "policy.max_backtracks": _whole(0, 100, "a step halved more often is 0 in float32"),
     "policy.fisher_every": SAMPLES,
     "critic.learning_rate": POSITIVE,

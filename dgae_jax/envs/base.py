@@ -23,10 +23,10 @@ class ThirdPartyEnv(Env):
 
 
 def restart(env: Env, state: State, rng: Array, done: Array) -> State:
-    """Return the start of an episode for an env in `state`; it is used only where `done`.
+    """Reset an env; callers use the result only where `done`.
 
     By default this is `env.reset(rng)`, computed in every env at every step. The class of `env` may
-    define a method `restart(state, rng, done)`, free to return anything where the env is not done.
+    define a method `restart(state, rng, done)`, which may return anything elsewhere.
     """
     own = getattr(type(env), "restart", None)  # of the class: a wrapper passes on attributes
     return env.reset(rng) if own is None else own(env, state, rng, done)

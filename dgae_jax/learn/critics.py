@@ -28,8 +28,8 @@ class Target(NamedTuple):
     compute: TargetFn
     recompute: bool = False
     """True to compute it at every gradient step with the current critic; False to compute it once
-    per iteration with the critic at rollout time. One-step targets only: a shuffled minibatch has
-    no key, trace and quantiles, which are None then."""
+    per iteration with the critic at rollout time. Only for one-step targets: `compute` then gets
+    key = trace = quantiles = None, since minibatches are shuffled."""
     lam: float | None = None
     """λ of the trace where it differs from that of the advantages."""
 

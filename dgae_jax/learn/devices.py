@@ -1,10 +1,9 @@
 """One program on several devices of a mesh with one axis.
 
 Envs are divided over the devices, and each rolls out its own without communication. The data are
-gathered on all of them, and each computes the estimates. Of the policy's and the critic's update
-
-- each has a CPU device of its own, because there a gradient step is too short to be shared;
-- accelerators share every minibatch, and XLA sums its gradient over them.
+gathered on all of them, and each computes the estimates. On CPUs the policy's update runs on one
+device and the critic's on another, because a gradient step is too short to be shared; accelerators
+share every minibatch, and XLA sums its gradient over them.
 
 Several seeds are divided instead, if their number allows it: then nothing is communicated at all.
 """

@@ -1,4 +1,7 @@
-"""Running statistics of observations and rewards, frozen while an iteration acts and learns.
+"""Running statistics of observations and rewards.
+
+Those of observations are frozen while an iteration acts and learns; rewards are scaled with their
+rollout included.
 
 Samples are bounded on their way into the statistics: none may count for more than all samples
 before it together, (x − mean)² ≤ Σ (xⱼ − mean)². One outlier then at most doubles a variance, and

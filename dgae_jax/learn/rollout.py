@@ -104,7 +104,7 @@ def rollout(
 
     A finished episode is followed by a fresh random one; `next_obs` stays the observation in which
     it ended. Where an action, state, reward or observation turns non-finite, the step is masked and
-    the episode ends as terminated with reward 0: only finite numbers leave this function.
+    the episode ends as terminated with reward 0: the transitions hold only finite numbers.
 
     Args:
         env: the task.

@@ -97,13 +97,13 @@ def trust_region(
 
     The direction solves (F + damping) x = −∇loss (Schulman et al. 2015). A step is accepted only if
     KL(old ‖ new) ≤ `max_kl` and the loss falls; otherwise the parameters stay, bit for bit. As in
-    the paper of TRPO the divergence is summed over the A action dimensions; where it is averaged
-    (sb3-contrib), max_kl and damping are ours over A.
+    the paper of TRPO the divergence is summed over the A action dimensions. sb3-contrib averages
+    it: divide our max_kl and damping by A to get its values.
 
     Args:
         policy: the policy network.
         loss: the surrogate.
-        max_kl: KL bound [nats] by the number of steps before.
+        max_kl: schedule, number of updates so far -> KL bound [nats].
         damping: multiple of the identity added to the Fisher matrix F.
         cg_iterations: iterations of conjugate gradient.
         max_backtracks: times a step is halved before it is given up.
@@ -168,8 +168,8 @@ def fisher_product(
 
 
 OPTIMIZERS: dict[str, Optimizer] = {
-    "adam": partial(optax.adam, eps=1e-5),  # as implementations of PPO (Andrychowicz et al. 2021)
-    "rmsprop": partial(optax.rmsprop, decay=0.99, eps=1e-5, eps_in_sqrt=False),  # as sb3's A2C
+    "adam": partial(optax.adam, eps=1e-5),  # Andrychowicz et al. 2021
+    "rmsprop": partial(optax.rmsprop, decay=0.99, eps=1e-5, eps_in_sqrt=False),  # as in sb3's A2C
 }
 
 

@@ -18,7 +18,7 @@ class Engine(NamedTuple):
     on_host: bool = False
     """True if it simulates on the CPU whatever JAX's device is."""
     package: str | None = None
-    """Module, and extra of this package, that must be installed beside the dependencies."""
+    """Name of the module needed, which is also the name of our extra."""
 
 
 ENGINES = {

@@ -138,7 +138,7 @@ def load_policy(
         if name not in (None, config.env):
             raise invalid("env", name, f"left out: {run_dir} is a run of {config.env}")
         if not (type(seed) is int and 0 <= seed < config.num_seeds):
-            allowed = f"a whole number from 0 to {config.num_seeds - 1}, the index of a seed"
+            allowed = f"an index below num_seeds ({config.num_seeds})"
             raise ConfigError(f"seed {seed}: must be {allowed}")
         found = checkpoint.load_networks(source, config, which)
         policy, critic = jax.tree.map(lambda x: x[seed], (found.policy, found.critic))

@@ -80,8 +80,8 @@ def save(
 ) -> Path:
     """Write `steps_….msgpack` atomically, unless a number is not finite, and delete old ones.
 
-    The latest `keep` files up to `steps` stay, and that of the best evaluation. Later files are
-    damaged: the run went back behind them.
+    Keep the `keep` latest up to `steps`, and the best. Files later than `steps` were damaged, so
+    the run resumed before them.
     """
     for name in not_finite(arrays):
         raise NotFiniteError(f"{name} is not finite after {steps:,} samples")

@@ -26,8 +26,8 @@ class RunOptions:
     keep_checkpoints: int = 3
     """Latest checkpoints to keep, beside the one with the best evaluation [files]."""
     devices: int | None = None
-    """Devices of each process, which divide the envs or the seeds; by default all, and of a CPU's
-    cores as many as have 16 envs each [devices]."""
+    """Devices of each process, which divide the envs or the seeds; by default all; on a CPU at
+    most one per 16 envs [devices]."""
     coordinator: str | None = None
     """Address of the first of several processes, HOST:PORT; detected under Slurm, Open MPI,
     Kubernetes and on TPU pods [address]."""
@@ -45,8 +45,8 @@ class RunOptions:
     """Failed iterations in a row (a skipped update, or most env steps masked) before the run
     stops [iterations]."""
     eval_engine: str | None = None
-    """Engine of evaluations: gymnasium, without noise, or one of --physics, with the noise of
-    training; by default the first that the task has."""
+    """Engine of evaluations: gymnasium (no noise) or an engine of --physics (training noise); by
+    default gymnasium where the task has it."""
     episodes: int = 20
     """Episodes of every evaluation, per run [episodes]."""
     debug_nonfinite: bool = False
@@ -131,11 +131,12 @@ def validate_options(options: RunOptions, config: ResolvedConfig) -> None:
             install = f'pip install "dgae_jax[{name}]"'
             raise ConfigError(f"log {name}: {library} is missing; {install}", "log")
     if options.resume is not None and options.run_dir is not None:
-        raise invalid("run_dir", options.run_dir, f"left out: --resume writes to {options.resume}")
+        both = f"run_dir {options.run_dir}: cannot be combined with --resume {options.resume}"
+        raise ConfigError(both, "run_dir")
     if options.resume_or_start and options.run_dir is None:
         raise invalid("resume_or_start", True, "used with --run-dir DIR")
     if options.inexact and options.resume is None and not options.resume_or_start:
-        raise invalid("inexact", True, "left out without --resume")
+        raise ConfigError("inexact: needs --resume", "inexact")
 
 
 def saved_options(options: RunOptions) -> dict[str, Any]:

@@ -150,8 +150,8 @@ def _check_resumable(config: ResolvedConfig, run_dir: Path, options: RunOptions)
     if spec_of(config.env).on_host:
         reasons.append(f"the envs of {config.env} begin new episodes")
     if reasons and not options.inexact:
-        must = "must be as it began, or with --inexact"
-        raise ConfigError(f"resume {run_dir}: {must}; now {'; '.join(reasons)}", "resume")
+        why = f"not bit-identical ({'; '.join(reasons)}); add --inexact to continue anyway"
+        raise ConfigError(f"resume {run_dir}: {why}", "resume")
     for reason in reasons:
         terminal.warn(f"warning: {reason}: the run is not bit-identical from here on")
 

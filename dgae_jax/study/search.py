@@ -95,9 +95,10 @@ def space_of(words: Sequence[str], config: ResolvedConfig) -> dict[str, Values]:
         name, _, text = word.partition("=")
         path = name.replace("-", "_")
         if path in (*SHARED, "seed", "num_seeds"):
-            raise invalid("search", word, f"of another setting: all trials share {path}")
+            why = f"cannot be searched: all trials share {path}"
+            raise ConfigError(f"search {word}: {why}", "search")
         if path in space:
-            raise invalid("search", word, f"the only range of {path}")
+            raise ConfigError(f"search {word}: {path} is given twice", "search")
         try:
             space[path] = _values(text)
         except ValueError:
@@ -107,7 +108,8 @@ def space_of(words: Sequence[str], config: ResolvedConfig) -> dict[str, Values]:
             try:
                 _with_values(config, {path: value})
             except ConfigError as reason:
-                raise invalid("search", word, f"valid throughout ({reason})") from None
+                why = f"an end of the range is invalid: {reason}"
+                raise ConfigError(f"search {word}: {why}", "search") from None
     return space
 
 

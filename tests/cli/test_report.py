@@ -42,12 +42,12 @@ def test_the_typical_run_is_the_median_seed_of_the_best_algorithm(tmp_path):
 @pytest.mark.parametrize(
     ("argv", "message"),
     [
-        ("", "STUDIES: must be the directory of one sweep or more"),
+        ("", "SWEEPS: must be the directory of one sweep or more"),
         ("TMP/none", "TMP/none: must be the directory of a sweep"),
         ("GOOD --videos", "--videos True: must be left out: the runs of GOOD are not here"),
         ("GOOD --out GOOD/study.json", "--out GOOD/study.json: must be a directory that can be"),
         ("GOOD --markdown TMP/no.md", "--markdown TMP/no.md: must be a file that can be read"),
-        ("GOOD GOOD --markdown x", "--markdown x: must be left out where several sweeps"),
+        ("GOOD GOOD --markdown x", "--markdown x: cannot be combined with several sweeps"),
     ],
 )
 def test_bad_input_is_refused_before_anything_is_written(argv, message, dgae, tmp_path):

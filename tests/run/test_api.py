@@ -111,7 +111,7 @@ def test_each_seed_has_its_policy(three_seeds):
     actions = [policy(observations(4)) for policy in policies]
     assert not np.array_equal(actions[0], actions[1])
     for seed in (3, -1, True, 1.0):
-        with pytest.raises(ConfigError, match=r"seed .*: must be a whole number from 0 to 2"):
+        with pytest.raises(ConfigError, match=r"seed .*: must be an index below num_seeds"):
             load_policy(three_seeds, seed=seed)
 
 

@@ -75,7 +75,7 @@ def test_gymnasium_run_repeats_and_resumes_in_new_episodes(tmp_path, capsys):
     assert [{**row, "seconds": 0} for row in rows[0]] == [{**row, "seconds": 0} for row in rows[1]]
     options = RunOptions(resume=tmp_path / "a", cache_dir=QUIET.cache_dir, episodes=1)
     longer = dataclasses.replace(config, total_steps=128)
-    with pytest.raises(ConfigError, match="--inexact; now the envs of gymnasium:Pend"):
+    with pytest.raises(ConfigError, match=r"not bit-identical \(the envs of gymnasium:Pend"):
         training.train(longer, options)
     training.train(longer, dataclasses.replace(options, inexact=True))
     assert "begin new episodes: the run is not bit-identical" in capsys.readouterr().err

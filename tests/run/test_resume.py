@@ -53,7 +53,7 @@ def test_every_algorithm_resumes_with_same_bits(algo, physics, tmp_path):
     [
         ({"gamma": 0.5}, "gamma 0.5: must be 0.99 as in"),
         ({"algo": "a2c"}, "algo a2c: must be ppo as in"),
-        ({"physics": "jax"}, r"with --inexact; now physics jax \(was native\)"),
+        ({"physics": "jax"}, r"not bit-identical \(physics jax \(was native\)"),
         ({"total_steps": 7 * 64}, "total_steps 448: must be at least the 512 that are done"),
     ],
 )
@@ -68,7 +68,7 @@ def test_other_machine_is_refused_unless_inexact(path, run_dir, capsys):
     written = json.loads((run_dir / "manifest.json").read_text())
     (written if len(path) == 1 else written[path[0]])[path[-1]] = 99
     files.write_json(run_dir / "manifest.json", written)
-    with pytest.raises(ConfigError, match=rf"--inexact; now {path[-1]} .* \(was 99\)"):
+    with pytest.raises(ConfigError, match=rf"not bit-identical \({path[-1]} .* \(was 99\)"):
         resume(small(), run_dir)
     assert resume(small(), run_dir, inexact=True) == 0
     assert "(was 99): the run is not bit-identical from here on" in capsys.readouterr().err
