@@ -136,7 +136,7 @@ def validate_options(options: RunOptions, config: ResolvedConfig) -> None:
     if options.resume_or_start and options.run_dir is None:
         raise invalid("resume_or_start", True, "used with --run-dir DIR")
     if options.inexact and options.resume is None and not options.resume_or_start:
-        raise ConfigError("inexact: needs --resume", "inexact")
+        raise ConfigError("inexact: needs --resume or --resume-or-start", "inexact")
 
 
 def saved_options(options: RunOptions) -> dict[str, Any]:

@@ -108,7 +108,7 @@ def space_of(words: Sequence[str], config: ResolvedConfig) -> dict[str, Values]:
             try:
                 _with_values(config, {path: value})
             except ConfigError as reason:
-                why = f"an end of the range is invalid: {reason}"
+                why = f"a value is invalid: {reason}"
                 raise ConfigError(f"search {word}: {why}", "search") from None
     return space
 

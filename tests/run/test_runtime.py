@@ -91,7 +91,7 @@ def test_two_devices_resume_bit_for_bit_and_one_is_refused(two_devices, tmp_path
     stopped_half_way(two_devices, half)
     ((_, err, code),) = finished([begun("--resume", half, "--devices", "1", *CACHE)])
     assert code == 2
-    assert "not bit-identical (devices 1 (was 2))" in err
+    assert "not bit-identical (devices 1 (was 2)" in err
     ((_, err, code),) = finished([begun("--resume", half, *CACHE)])
     assert code == 0, err
     assert last(half).read_bytes() == last(two_devices).read_bytes()
