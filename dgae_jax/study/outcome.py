@@ -21,13 +21,6 @@ from dgae_jax.study.search import Tuning
 
 FINISHED = (TrialState.COMPLETE, TrialState.PRUNED)
 
-PLOTS: dict[str, tuple[Callable[..., Any], int]] = {
-    "Return of each trial, and the best so far": (plots.plot_optimization_history, 1),
-    "Share of the spread that each setting explains": (plots.plot_param_importances, 4),
-    "Return by setting": (plots.plot_slice, 1),
-}
-"""By title: Optuna's function, and the number of different returns below which it says nothing."""
-
 
 def finished(study: Study) -> list[FrozenTrial]:
     """Return the trials that were trained to their end or pruned."""
@@ -36,7 +29,7 @@ def finished(study: Study) -> list[FrozenTrial]:
 
 def say_new(study: Study, count: int) -> int:
     """Print the trials that finished after the first `count`, and return the new count."""
-    trials = sorted(finished(study), key=lambda trial: trial.datetime_complete or trial.number)
+    trials = sorted(finished(study), key=lambda trial: str(trial.datetime_complete))
     for trial in trials[count:]:
         terminal.say(_line(trial))
     return len(trials)
@@ -44,12 +37,9 @@ def say_new(study: Study, count: int) -> int:
 
 def _line(trial: FrozenTrial) -> str:
     result = "none" if trial.value is None else f"{trial.value:,.1f}"
-    settings = ", ".join(f"{path} {_shown(value)}" for path, value in trial.params.items())
+    values = {k: f"{v:.5g}" if isinstance(v, float) else v for k, v in trial.params.items()}
+    settings = ", ".join(f"{path} {value}" for path, value in values.items())
     return f"trial {trial.number}: {trial.state.name.lower()}, return {result} ({settings})"
-
-
-def _shown(value: Any) -> str:
-    return f"{value:.5g}" if isinstance(value, float) else str(value)
 
 
 def write(tuning: Tuning, study: Study) -> int:
@@ -64,29 +54,30 @@ def write(tuning: Tuning, study: Study) -> int:
         table.writerow([trial.number, trial.state.name.lower(), trial.value, seconds, *values])
     files.replace(tuning.directory / "trials.csv", text.getvalue().encode())
     best = [trial for trial in trials if trial.state == TrialState.COMPLETE]
-    best.sort(key=lambda trial: (-(trial.value or 0.0), trial.number))
     if not best:
         log = f"{tuning.directory}/worker-*.log"
         terminal.warn(f"all {len(trials)} trials were pruned or diverged; see {log}")
         return 1
+    best.sort(key=lambda trial: trial.value or 0.0, reverse=True)
     config = tuning.trial_config(best[0].params).as_config().replace(seed=0, num_seeds=1)
     files.write_json(best_file, to_dict(config))
-    count = len({trial.value for trial in best})
+    lines = [_line(trial) for trial in best[:10]]
+    draws = [plots.plot_optimization_history, plots.plot_slice]
+    if len({trial.value for trial in best}) >= 4:  # fewer explain no importance
+        draws.append(plots.plot_param_importances)
     loader = jinja2.PackageLoader("dgae_jax.study")
     templates = jinja2.Environment(loader=loader, autoescape=True, trim_blocks=True)
     page = templates.get_template("tuning.html").render(
         tuning=tuning,
-        shown=_shown,
         engine=engine_of(tuning.config, tuning.options.eval_engine),
         trials=len(trials),
-        best=best[:10],
-        plots={name: _png(study, draw) for name, (draw, least) in PLOTS.items() if count >= least},
+        best=lines,
+        plots=[_png(study, draw) for draw in draws],
         best_file=best_file,
     )
     files.replace(tuning.directory / "tuning.html", page.encode())
     terminal.say(f"{len(best)} of {len(trials)} trials were trained to their end, the best are")
-    for trial in best[:10]:
-        terminal.say(_line(trial))
+    terminal.say("\n".join(lines))
     terminal.say(f"train with the best settings: dgae train --config {best_file}")
     return 0
 

@@ -2,7 +2,7 @@
 
 `gamma=0.95:0.999` is a range, `policy.learning_rate=log:1e-4:1e-2` one on a logarithmic scale,
 `num_envs=int:4:64` (or `int:log:4:64`) one of whole numbers and `critic.minibatches=16,32,64` a
-choice. Widths of layers are written `64x64`. Nothing here imports JAX or Optuna.
+choice. Widths of layers are written `64x64`.
 """
 
 import json
@@ -28,10 +28,10 @@ class Values:
     """The values that trials may give to a setting."""
 
     text: str
-    ends: Sequence[Any]
-    """Lowest and highest value, or all choices."""
     kind: str
     """float, int or categorical, as in the methods of Optuna's `Trial`."""
+    ends: Sequence[Any]
+    """Lowest and highest value, or all choices."""
     is_log: bool = False
 
     def suggest(self, trial: Any, path: str) -> Any:
@@ -42,13 +42,14 @@ class Values:
 
     def include(self, value: Any) -> bool:
         """Return whether a trial could give this value."""
-        is_choice = self.kind == "categorical"
-        return value in self.ends if is_choice else self.ends[0] <= value <= self.ends[1]
+        if self.kind == "categorical":
+            return value in self.ends
+        return self.ends[0] <= value <= self.ends[1]
 
 
 @dataclass(frozen=True)
 class Tuning:
-    """One tuning, as every process that works on it knows it."""
+    """One tuning, shared by all its processes; most fields are flags of `dgae tune`."""
 
     config: ResolvedConfig
     """Settings that are not searched; its values of those that are make the first trial."""
@@ -56,15 +57,11 @@ class Tuning:
     """By dotted path of the setting."""
     directory: Path
     options: RunOptions = field(default_factory=RunOptions)
-    """Options of the trials' runs."""
     storage: str | None = None
     """URL of a PostgreSQL database; None for SQLite in the directory."""
     trials: int = 50
-    """Trials to finish, by all processes together."""
     seeds: int = 2
-    """Seeds that each trial trains."""
     workers: int = 1
-    """Processes on this machine."""
     sampler_seed: int = 0
     heartbeat: int = 20
     """Time between heartbeats; a trial without one for three times as long is retried [s]."""
@@ -81,35 +78,26 @@ class Tuning:
 
 
 def space_of(words: Sequence[str], config: ResolvedConfig) -> dict[str, Values]:
-    """Parse what is to be searched, and check its ends against the rest of the configuration.
-
-    Args:
-        words: `SETTING=VALUES`, as in the docstring of this module.
-        config: values of all other settings.
-
-    Raises:
-        ConfigError: a setting is unknown, fixed or has no effect, or an end is invalid.
-    """
+    """Parse and check each `SETTING=VALUES`; raise ConfigError for the first that is invalid."""
     space: dict[str, Values] = {}
     for word in words:
         name, _, text = word.partition("=")
         path = name.replace("-", "_")
         if path in (*SHARED, "seed", "num_seeds"):
-            why = f"cannot be searched: all trials share {path}"
-            raise ConfigError(f"search {word}: {why}", "search")
+            message = f"search {word}: cannot be searched: all trials share {path}"
+            raise ConfigError(message, "search")
         if path in space:
             raise ConfigError(f"search {word}: {path} is given twice", "search")
         try:
             space[path] = _values(text)
+            for value in space[path].ends:
+                _with_values(config, {path: value})
+        except ConfigError as reason:
+            message = f"search {word}: a value is invalid: {reason}"
+            raise ConfigError(message, "search") from None
         except ValueError:
             forms = "LOW:HIGH, log:LOW:HIGH, int:LOW:HIGH, int:log:LOW:HIGH or VALUE,VALUE"
             raise invalid("search", word, f"SETTING={forms}, with LOW below HIGH") from None
-        for value in space[path].ends:
-            try:
-                _with_values(config, {path: value})
-            except ConfigError as reason:
-                why = f"a value is invalid: {reason}"
-                raise ConfigError(f"search {word}: {why}", "search") from None
     return space
 
 
@@ -120,11 +108,11 @@ def _values(text: str) -> Values:
         low, high = kind(found[3]), kind(found[4])
         if not low < high or (is_log and low <= 0):
             raise ValueError(text)
-        return Values(text, (low, high), kind.__name__, is_log)
-    choices = tuple(map(_choice, text.split(",")))
+        return Values(text, kind.__name__, (low, high), is_log)
+    choices = tuple(_choice(word) for word in text.split(","))
     if len(set(choices)) != len(choices) or len(choices) < 2 or "" in choices:
         raise ValueError(text)
-    return Values(text, choices, "categorical")
+    return Values(text, "categorical", choices)
 
 
 def _choice(text: str) -> Any:

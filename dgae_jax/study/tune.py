@@ -14,12 +14,11 @@ from typing import Any
 import numpy as np
 import optuna
 import sqlalchemy.exc
-from optuna.storages import RDBStorage, RetryHeartbeatStaleTrialCallback
 from optuna.study import Study
 from optuna.trial import FrozenTrial, Trial, TrialState
 
 from dgae_jax.configs.config import ConfigError, invalid
-from dgae_jax.configs.serial import flat, to_dict
+from dgae_jax.configs.serial import to_dict
 from dgae_jax.run import files, terminal, training
 from dgae_jax.run.options import engine_of
 from dgae_jax.run.runtime import Signals
@@ -38,9 +37,6 @@ POLL = 0.5
 
 def tune(tuning: Tuning) -> int:
     """Finish the trials of a tuning, together with all processes that share it.
-
-    Args:
-        tuning: what is searched and where. If it was begun before, it continues.
 
     Returns:
         The exit code: 0 done, 1 trials are missing, 128 + a signal that stopped it.
@@ -61,8 +57,8 @@ def tune(tuning: Tuning) -> int:
                 done = outcome.say_new(study, done)
         if (done := outcome.say_new(study, done)) < tuning.trials:
             how = f"by {signals.name}" if signals.received else f"early, see {logs[0]}"
-            said = f"{done} of {tuning.trials} trials are finished"
-            terminal.say(f"stopped {how}: {said}; the same command continues")
+            said = f"{done} of {tuning.trials} trials are finished; the same command continues"
+            terminal.say(f"stopped {how}: {said}")
             return signals.exit_code if signals.received else 1
         with files.turn(tuning.directory):
             return outcome.write(tuning, study)
@@ -82,7 +78,7 @@ def open_study(tuning: Tuning, worker: int = 0) -> Study:
     # SQLite has one writer at a time; others wait for up to a minute
     url = tuning.storage or f"sqlite:///{tuning.directory.absolute() / 'optuna.db'}?timeout=60"
     try:
-        storage = RDBStorage(
+        storage = optuna.storages.RDBStorage(
             url,
             heartbeat_interval=tuning.heartbeat,
             grace_period=3 * tuning.heartbeat,
@@ -96,11 +92,17 @@ def open_study(tuning: Tuning, worker: int = 0) -> Study:
             pruner=optuna.pruners.MedianPruner(),
         )
     except (sqlalchemy.exc.SQLAlchemyError, optuna.exceptions.OptunaError) as reason:
-        without_password = sqlalchemy.engine.make_url(url).render_as_string(hide_password=True)
+        address = sqlalchemy.make_url(url).render_as_string(hide_password=True)
         why = str(getattr(reason, "orig", None) or reason).partition("\n")[0]
-        allowed = f"a database that can be reached ({why})"
-        raise invalid("storage", without_password, allowed) from reason
-    _check_same(study, tuning)
+        raise invalid("storage", address, f"a database that can be reached ({why})") from reason
+    search = {path: each.text for path, each in tuning.space.items()}
+    engine = engine_of(tuning.config, tuning.options.eval_engine)
+    tuned = [to_dict(tuning.config), search, tuning.seeds, tuning.options.episodes, engine]
+    ours = json.dumps(tuned, sort_keys=True)
+    if study.user_attrs.get("tuning", ours) != ours:
+        allowed = "new, or of the same settings, search, seeds, episodes and evaluation engine"
+        raise invalid("study", tuning.directory, allowed)
+    study.set_user_attr("tuning", ours)
     count = len(study.get_trials(deepcopy=False))
     if not count and (start := tuning.start_values()):
         study.enqueue_trial(start, skip_if_exists=True)
@@ -112,24 +114,8 @@ def open_study(tuning: Tuning, worker: int = 0) -> Study:
 
 def _retry(study: Study, trial: FrozenTrial) -> None:
     """Enqueue a trial again, with what it has reported; its settings may be what kills it."""
-    RetryHeartbeatStaleTrialCallback(5, inherit_intermediate_values=True)(study, trial)
-
-
-def _check_same(study: Study, tuning: Tuning) -> None:
-    """Write what is tuned, or refuse to tune anything else in this study."""
-    judged = {
-        "tuning_seeds": tuning.seeds,
-        "episodes": tuning.options.episodes,
-        "eval_engine": engine_of(tuning.config, tuning.options.eval_engine),
-        "search": {path: each.text for path, each in tuning.space.items()},
-    }
-    ours = flat(json.loads(json.dumps({**to_dict(tuning.config), **judged})))
-    theirs = study.user_attrs.get("tuning", ours)
-    study.set_user_attr("tuning", theirs)
-    for name in {**ours, **theirs}:
-        if ours.get(name) != theirs.get(name):
-            allowed = f"{theirs.get(name)} as in {tuning.directory}, or with another --study"
-            raise invalid(name, ours.get(name), allowed)
+    retry = optuna.storages.RetryHeartbeatStaleTrialCallback
+    retry(5, inherit_intermediate_values=True)(study, trial)
 
 
 def work(tuning: Tuning, number: int = 0) -> int:
@@ -156,10 +142,7 @@ def work(tuning: Tuning, number: int = 0) -> int:
 
 
 def _train(tuning: Tuning, study: Study, trial: Trial) -> float:
-    """Train one trial in its own run directory and return its mean return at the end.
-
-    A trial that a signal or a fault of the machine stops is enqueued again, and resumes.
-    """
+    """Train a trial in its run directory; one that a signal or a fault stops is tried again."""
     values = {path: each.suggest(trial, path) for path, each in tuning.space.items()}
     number = trial.user_attrs.get("run", trial.number)  # a retry has the attributes of the trial
     trial.set_user_attr("run", number)
@@ -177,20 +160,20 @@ def _train(tuning: Tuning, study: Study, trial: Trial) -> float:
         )
         training.prepare(config, options)
     except ConfigError as reason:
-        raise optuna.TrialPruned(str(reason)) from reason
+        raise optuna.TrialPruned from reason
 
     def report(steps: int, result: dict[str, Any]) -> None:
         trial.report(result["return_mean"], steps // every)
         if trial.should_prune():
-            raise optuna.TrialPruned(f"worse than the median after {steps:,} steps")
+            raise optuna.TrialPruned
 
     try:
         value = float(training.train(config, options, report).evaluation["return_mean"])
     except DivergedError as reason:
-        raise optuna.TrialPruned(str(reason)) from reason
+        raise optuna.TrialPruned from reason
     except RunError:
         _retry(study, study.trials[trial.number])
         raise
     if not math.isfinite(value):
-        raise optuna.TrialPruned("its return is not finite")
+        raise optuna.TrialPruned
     return value
