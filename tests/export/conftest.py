@@ -1,6 +1,5 @@
 """A trained run, and policies without training."""
 
-import dataclasses
 from typing import NamedTuple
 
 import jax
@@ -12,15 +11,17 @@ from dgae_jax.configs.resolved import resolve
 from dgae_jax.export import gl
 from dgae_jax.learn.types import InferenceState
 from dgae_jax.run import checkpoint
-from dgae_jax.run.training import train
-from tests.runs import QUIET, small
+from tests.cli import conftest as cli
+from tests.runs import exit_code, small
+
+dgae = cli.dgae
 
 
 @pytest.fixture(scope="session")
 def trained(tmp_path_factory):
     """The directory of a run with two seeds."""
     run_dir = tmp_path_factory.mktemp("runs") / "dppo"
-    train(small("dppo", seeds=2), dataclasses.replace(QUIET, run_dir=run_dir))
+    assert exit_code(small("dppo", seeds=2), run_dir=run_dir) == 0
     return run_dir
 
 
@@ -31,9 +32,7 @@ def _config(algo, kind, **changes):
 
 
 CONFIGS = {
-    "quantile": _config("dppo", "quantile"),
-    "ordered": _config("dppo", "ordered"),
-    "sorted": _config("dppo", "sorted"),
+    **{kind: _config("dppo", kind) for kind in ("quantile", "ordered", "sorted")},
     "scalar": _config(
         "trpo",
         "scalar",

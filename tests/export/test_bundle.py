@@ -16,7 +16,6 @@ import pytest
 from numpy.testing import assert_allclose
 
 import dgae_jax as dg
-from dgae_jax.cli.main import command
 from dgae_jax.configs.config import ConfigError
 from dgae_jax.export import arrays, bundle
 from dgae_jax.export.templates.policy import Policy
@@ -166,25 +165,10 @@ def test_facts_of_a_policy_file_come_from_its_sweep(tmp_path):
         assert fact in card()
 
 
-@pytest.fixture
-def export(monkeypatch, capsys):
-    """`dgae export` in this process: exit code, stdout, stderr."""
-
-    def export(*argv):
-        monkeypatch.setattr(sys, "argv", ["dgae export", *map(str, argv)])
-        try:
-            code = command("export")()
-        except SystemExit as stop:
-            code = stop.code
-        return code, *capsys.readouterr()
-
-    return export
-
-
-def test_each_format_becomes_a_directory(export, monkeypatch, tmp_path):
+def test_each_format_becomes_a_directory(dgae, monkeypatch, tmp_path):
     file = make_untrained("scalar", tmp_path).file
     for _ in range(2):  # files are replaced
-        code, out, err = export(file, "--to", *FORMATS, "--index", 1)
+        code, out, err = dgae("export", file, "--to", *FORMATS, "--index", 1)
         assert (code, err) == (0, "")
     assert [line.split(": ")[1] for line in out.splitlines()] == [
         "policy.npz, policy.py, README.md",
@@ -192,7 +176,7 @@ def test_each_format_becomes_a_directory(export, monkeypatch, tmp_path):
         "policy.npz, policy.py, agent.py, README.md",
     ]
     monkeypatch.setitem(sys.modules, "onnx", None)
-    code, _, err = export(file, "--to", "npz", "onnx", "--out", tmp_path / "out")
+    code, _, err = dgae("export", file, "--to", "npz", "onnx", "--out", tmp_path / "out")
     assert (code, 'pip install "dgae_jax[export]"' in err) == (2, True)
     assert not (tmp_path / "out").exists()
 

@@ -1,6 +1,5 @@
 """A training state, a finished run and a copy of it."""
 
-import dataclasses
 import shutil
 from functools import cache
 
@@ -8,8 +7,7 @@ import pytest
 
 from dgae_jax.learn.build import make_task, make_trainer, seed_keys
 from dgae_jax.run import training
-from dgae_jax.run.training import train_command
-from tests.runs import QUIET, SMALL, small
+from tests.runs import SMALL, exit_code, small
 
 
 @pytest.fixture(scope="session", autouse=True)
@@ -27,7 +25,7 @@ def state():
 
 
 def trained(run_dir, config):
-    assert train_command(config, dataclasses.replace(QUIET, run_dir=run_dir)) == 0
+    assert exit_code(config, run_dir=run_dir) == 0
     return run_dir
 
 

@@ -97,10 +97,6 @@ def test_part_is_loaded_without_the_rest(tmp_path):
     path = tmp_path / "x.msgpack"
     checkpoint.write(path, SMALL, {"a": a, "b": np.full(3, np.nan), "c": c})
     chex.assert_trees_all_equal(checkpoint.load(path, {"a": a, "c": c}), {"a": a, "c": c})
-    with pytest.raises(CheckpointError, match="is of another run, d is missing"):
-        checkpoint.load(path, {"a": a, "d": c})
-    with pytest.raises(CheckpointError, match=r"a is float32\(2,\), here int32\(3,\)"):
-        checkpoint.load(path, {"a": c})
 
 
 @pytest.mark.parametrize(

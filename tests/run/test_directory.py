@@ -17,9 +17,8 @@ from dgae_jax.configs.serial import to_dict
 from dgae_jax.run import directory
 from dgae_jax.run.directory import InUseError
 from dgae_jax.run.options import RunOptions
-from dgae_jax.run.training import train_command
 from tests.helpers import ROOT
-from tests.runs import QUIET, SMALL, create, small
+from tests.runs import SMALL, create, exit_code, small
 
 
 def test_new_directory_holds_config_and_manifest(tmp_path):
@@ -30,13 +29,17 @@ def test_new_directory_holds_config_and_manifest(tmp_path):
     assert {"command", "git_revision", "device", "python", "started"} <= set(manifest)
 
 
-def test_used_or_unwritable_directory_is_refused(tmp_path):
+def test_used_or_unwritable_directory_is_refused(tmp_path, monkeypatch):
     (tmp_path / "note.txt").write_text("mine")
     with pytest.raises(ConfigError, match=r"run_dir .*: must be a new or empty directory"):
         create(tmp_path)
     assert [p.name for p in tmp_path.iterdir()] == ["note.txt"]
     with pytest.raises(ConfigError, match="must be a directory that can be written"):
         create(tmp_path / "note.txt" / "below")
+    full = OSError(28, "No space left on device")
+    monkeypatch.setattr(os, "fsync", Mock(side_effect=full))
+    with pytest.raises(ConfigError, match=r"that can be written \(No space left"):
+        create(tmp_path / "run")
 
 
 BAD_ENV = json.dumps(to_dict(dataclasses.replace(SMALL, env="hoper")))
@@ -56,7 +59,7 @@ def test_directory_in_use_is_refused_and_left_alone(run_dir):
     with directory.locked(run_dir):
         directory.write_config(run_dir, directory.read_config(run_dir))
         with pytest.raises(InUseError, match="another process is training there"):
-            train_command(small(), dataclasses.replace(QUIET, resume=run_dir))
+            exit_code(small(), resume=run_dir)
     with directory.locked(run_dir):
         pass
 
@@ -74,7 +77,7 @@ def test_directory_that_cannot_be_locked_is_refused(run_dir):
     (run_dir / "metrics.jsonl").unlink()
     (run_dir / "metrics.jsonl").mkdir()
     with pytest.raises(ConfigError, match="must be a directory that can be written"):
-        train_command(small(), dataclasses.replace(QUIET, resume=run_dir))
+        exit_code(small(), resume=run_dir)
 
 
 @pytest.mark.parametrize("make", [lambda path: path.symlink_to("outside"), os.mkfifo])
@@ -84,7 +87,7 @@ def test_link_or_pipe_in_run_directory_is_refused(name, make, run_dir):
     make(run_dir / name)
     before = sorted((p, p.lstat().st_mtime_ns) for p in run_dir.rglob("*"))
     with pytest.raises(ConfigError, match=rf"run/{name}: must be in the run directory itself"):
-        train_command(small(), dataclasses.replace(QUIET, resume=run_dir))
+        exit_code(small(), resume=run_dir)
     assert sorted((p, p.lstat().st_mtime_ns) for p in run_dir.rglob("*")) == before
 
 
@@ -94,16 +97,9 @@ def test_link_in_place_of_written_file_is_not_followed(run_dir, tmp_path):
     for link in links:
         link.unlink(missing_ok=True)
         link.symlink_to(tmp_path / "outside")
-    assert train_command(small(), dataclasses.replace(QUIET, resume=run_dir)) == 0
+    assert exit_code(small(), resume=run_dir) == 0
     assert (tmp_path / "outside").read_text() == "mine"
     assert not any(link.is_symlink() for link in links)
-
-
-def test_full_disk_is_refused(tmp_path, monkeypatch):
-    full = OSError(28, "No space left on device")
-    monkeypatch.setattr(os, "fsync", Mock(side_effect=full))
-    with pytest.raises(ConfigError, match=r"that can be written \(No space left"):
-        create(tmp_path / "run")
 
 
 class Killed(BaseException):

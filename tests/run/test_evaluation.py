@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from dgae_jax.configs.config import ConfigError
+from dgae_jax.configs.config import ConfigError, NoiseConfig
 from dgae_jax.learn.build import make_task, make_trainer, policies_of, seed_keys
 from dgae_jax.run import episodes
 from dgae_jax.run.evaluation import (
@@ -55,6 +55,13 @@ def test_native_and_gymnasium_agree(state):
     )
     error = (ours["return_std"] ** 2 + theirs["return_std"] ** 2) ** 0.5 / 40**0.5
     assert abs(ours["return_mean"] - theirs["return_mean"]) < 4 * error
+
+
+def test_only_own_engines_play_with_noise(state):
+    noisy, how = dataclasses.replace(SMALL, noise=NoiseConfig(reward=100.0)), {"episodes": 1}
+    calm, own = (evaluate_policies(policies_of(state), noisy, engine=x, **how) for x in ENGINES)
+    # some ten steps, each with a reward of 1 or 2
+    assert abs(own["return_mean"]) > 100 > calm["return_mean"] > 0
 
 
 @pytest.mark.parametrize("engine", ENGINES)

@@ -1,7 +1,6 @@
 """Runs that end early, and continue."""
 
 import contextlib
-import dataclasses
 import resource
 import shutil
 import signal
@@ -14,28 +13,17 @@ from dgae_jax.configs.resolved import resolve
 from dgae_jax.run import checkpoint, directory, logger, metrics, training
 from dgae_jax.run.logger import RunLogger
 from dgae_jax.run.options import RunOptions
-from dgae_jax.run.training import train_command
-from tests.runs import QUIET, SMALL, last, small, timeless
+from tests.runs import SMALL, assert_same, each_signal, exit_code, last, small
 
 
 def resumed_as(finished, run_dir):
     """Resume a run and compare it with one that never stopped."""
-    assert train_command(small(), dataclasses.replace(QUIET, resume=run_dir)) == 0
-    assert last(run_dir).read_bytes() == last(finished).read_bytes()
-    assert timeless(run_dir) == timeless(finished)
-    ours, theirs = (d / "evaluations.jsonl" for d in (run_dir, finished))
-    assert ours.read_bytes() == theirs.read_bytes()
+    assert exit_code(small(), resume=run_dir) == 0
+    assert_same(run_dir, finished)
 
 
 @pytest.mark.parametrize("evaluation", [1, 2])
-@pytest.mark.parametrize(
-    ("kind", "code"),
-    [
-        (signal.SIGTERM, 143),
-        pytest.param(signal.SIGINT, 130, marks=pytest.mark.slow),
-        pytest.param(signal.SIGHUP, 129, marks=pytest.mark.slow),
-    ],
-)
+@each_signal
 def test_signal_breaks_off_evaluation(kind, code, evaluation, finished, tmp_path, monkeypatch):
     run_dir, calls = tmp_path / "run", []
     honest = logger.evaluate_policies
@@ -47,7 +35,7 @@ def test_signal_breaks_off_evaluation(kind, code, evaluation, finished, tmp_path
         return honest(*args, **how)
 
     monkeypatch.setattr(logger, "evaluate_policies", interrupted)
-    assert train_command(small(), dataclasses.replace(QUIET, run_dir=run_dir)) == code
+    assert exit_code(small(), run_dir=run_dir) == code
     assert not (run_dir / "evaluation.json").exists()
     resumed_as(finished, run_dir)
 
@@ -60,7 +48,7 @@ def test_vanished_directory_ends_run_in_one_line(tmp_path, capsys, monkeypatch):
         return honest(self, *args)
 
     monkeypatch.setattr(RunLogger, "append", append)
-    assert train_command(small(), dataclasses.replace(QUIET, run_dir=run_dir)) == 1
+    assert exit_code(small(), run_dir=run_dir) == 1
     why = f"{run_dir}/metrics.jsonl: cannot be written (No such file or directory)"
     assert capsys.readouterr().err == f"stopped: {why}; there is no checkpoint\n"
 
@@ -78,7 +66,7 @@ def test_full_disk_ends_run_that_can_resume(finished, tmp_path, capsys):
     run_dir, size = tmp_path / "run", last(finished).stat().st_size
     assert 1.1 * size < (finished / "curve.png").stat().st_size
     with no_file_larger_than(int(1.1 * size)):
-        assert train_command(small(), dataclasses.replace(QUIET, run_dir=run_dir)) == 1
+        assert exit_code(small(), run_dir=run_dir) == 1
     why = f"{run_dir}/curve.png: cannot be written (File too large)"
     left = f"continue from {last(run_dir).name} with --resume {run_dir}"
     assert capsys.readouterr().err == f"stopped: {why}; {left}\n"
@@ -90,8 +78,7 @@ def test_nonfinite_updates_are_skipped_counted_and_end_run(tmp_path, capsys):
     run_dir = tmp_path / "run"
     changes = {"policy.learning_rate": 1e30, "policy.max_grad_norm": 1e30}
     broken = resolve(small().as_config().replace(**changes))
-    options = dataclasses.replace(QUIET, run_dir=run_dir, max_nonfinite=3)
-    assert train_command(broken, options) == 1
+    assert exit_code(broken, run_dir=run_dir, max_nonfinite=3) == 1
     assert "stopped: non-finite updates" in capsys.readouterr().err
     assert sum(row["skipped"] for row in metrics.read(run_dir / "metrics.jsonl")) >= 3
     state, _ = checkpoint.latest_train_state(run_dir, directory.read_config(run_dir))
@@ -108,24 +95,25 @@ def test_failures_within_a_dispatch_are_seen():
     assert (failures.tolist(), most) == ([1, 0], 4)
 
 
-@pytest.mark.parametrize(
-    ("reason", "stopped"),
-    [
-        (jax.errors.JaxRuntimeError("RESOURCE_EXHAUSTED: Out of memory.\nmore"), True),
-        (jax.errors.JaxRuntimeError("INTERNAL: a bug"), False),
-    ],
-)
-def test_out_of_memory_ends_run_in_one_line(reason, stopped, tmp_path, capsys, monkeypatch):
-    def fails(*_, **__):
-        raise reason
+def test_nonfinite_network_ends_run_unsaved_in_one_line(tmp_path, capsys, monkeypatch):
+    run_dir, broken = tmp_path / "run", {"policy.params": np.array([np.nan])}
+    monkeypatch.setattr(checkpoint, "arrays_of", lambda state: broken)
+    assert exit_code(small(), run_dir=run_dir) == 1
+    why = "policy.params is not finite after 256 samples, which is not saved"
+    assert capsys.readouterr().err == f"stopped: {why}; there is no checkpoint\n"
 
+
+def test_out_of_memory_ends_run_in_one_line(tmp_path, capsys, monkeypatch):
     run_dir = tmp_path / "run"
+    reasons = iter(["INTERNAL: a bug", "RESOURCE_EXHAUSTED: Out of memory.\nmore"])
+
+    def fails(*_, **__):
+        raise jax.errors.JaxRuntimeError(next(reasons))
+
     monkeypatch.setattr(logger, "evaluate_policies", fails)
-    if not stopped:
-        with pytest.raises(jax.errors.JaxRuntimeError, match="a bug"):
-            train_command(small(), dataclasses.replace(QUIET, run_dir=run_dir))
-        return
-    assert train_command(small(), dataclasses.replace(QUIET, run_dir=run_dir)) == 1
+    with pytest.raises(jax.errors.JaxRuntimeError, match="a bug"):
+        exit_code(small(), run_dir=run_dir)
+    assert exit_code(small(), resume=run_dir) == 1
     why = "out of memory (RESOURCE_EXHAUSTED: Out of memory.)"
     left = f"continue from {last(run_dir).name} with --resume {run_dir}"
     assert capsys.readouterr().err == f"stopped: {why}; {left}\n"

@@ -10,9 +10,8 @@ import pytest
 import dgae_jax as dg
 from dgae_jax.run import directory
 from dgae_jax.run.evaluation import evaluate_run
-from dgae_jax.run.training import train_command
 from tests.helpers import ROOT
-from tests.runs import QUIET
+from tests.runs import exit_code
 
 LEGACY = ROOT / "tests" / "data" / "schema3"
 OBS = np.linspace(-1, 1, 11)
@@ -42,6 +41,6 @@ def test_old_run_is_evaluated_to_the_same_return():
 def test_old_run_is_resumed(tmp_path):
     old_run = shutil.copytree(LEGACY / "run", tmp_path / "run")
     config = dataclasses.replace(directory.read_config(old_run), total_steps=384)
-    assert train_command(config, dataclasses.replace(QUIET, resume=old_run, inexact=True)) == 0
+    assert exit_code(config, resume=old_run, inexact=True) == 0
     assert (old_run / "checkpoints" / "steps_000000000384.msgpack").exists()
     assert json.loads((old_run / "config.json").read_text())["schema"] == 3

@@ -1,6 +1,5 @@
 """Metric loggers, read back from what they wrote."""
 
-import dataclasses
 import importlib.util
 import json
 import shutil
@@ -14,10 +13,9 @@ import pytest
 from dgae_jax.configs.config import ConfigError
 from dgae_jax.run import directory, files, loggers, metrics
 from dgae_jax.run.options import METRIC_LOGGERS, RunOptions, validate_options
-from dgae_jax.run.training import train_command
-from tests.runs import QUIET, SMALL, last, small, stopped_half_way, timeless
+from tests.runs import SMALL, assert_same, exit_code, small, stopped_half_way
 
-SEEDS = 2
+CONFIG = small("a2c", seeds=3)
 
 
 def needs(name):
@@ -133,24 +131,11 @@ def check(name, run_dir, seed, but=()):
     assert theirs == {(s, k): float(kind(x)) for (s, k), x in ours.items() if k not in but}
 
 
-def train(run_dir, **options):
-    options = options if "resume" in options else {"run_dir": run_dir, **options}
-    return train_command(small(seeds=SEEDS), dataclasses.replace(QUIET, **options))
-
-
-@pytest.fixture(scope="module")
-def plain(tmp_path_factory):
-    """A run of two seeds without loggers."""
-    run_dir = tmp_path_factory.mktemp("runs") / "plain"
-    assert train(run_dir) == 0
-    return run_dir
-
-
 @pytest.fixture(scope="module")
 def logged(tmp_path_factory):
-    """The same run with all loggers that are installed."""
+    """The run `three_seeds` with all loggers that are installed."""
     run_dir = tmp_path_factory.mktemp("runs") / "logged"
-    assert train(run_dir, log=INSTALLED) == 0
+    assert exit_code(CONFIG, run_dir=run_dir, log=INSTALLED) == 0
     return run_dir
 
 
@@ -160,12 +145,9 @@ def test_logger_has_every_number_once(name, logged):
     check(name, logged, 1)
 
 
-def test_loggers_change_no_bit(plain, logged):
-    assert last(logged).read_bytes() == last(plain).read_bytes()
-    assert timeless(logged) == timeless(plain)
-    ours, theirs = (d / "evaluations.jsonl" for d in (logged, plain))
-    assert ours.read_bytes() == theirs.read_bytes()
-    assert not (plain / "sinks.json").exists()
+def test_loggers_change_no_bit(three_seeds, logged):
+    assert_same(logged, three_seeds)
+    assert not (three_seeds / "sinks.json").exists()
 
 
 @pytest.mark.parametrize("name", READABLE)
@@ -173,15 +155,15 @@ def test_resumed_run_logs_each_step_once(name, logged, tmp_path):
     run_dir = tmp_path / "half"
     stopped_half_way(logged, run_dir)
     assert directory.saved_options(run_dir).log == INSTALLED
-    assert train(run_dir, resume=run_dir, log=(name,)) == 0
+    assert exit_code(CONFIG, resume=run_dir, log=(name,)) == 0
     # a logger that cannot go back has the times of the first attempt
     kept = () if name in loggers.REWINDS else ("seconds",)
     check(name, run_dir, 1, but=kept)
 
 
 @pytest.mark.parametrize("name", READABLE)
-def test_logger_that_is_added_later_gets_what_came_before(name, plain, tmp_path):
-    run_dir = shutil.copytree(plain, tmp_path / "run")
+def test_logger_that_is_added_later_gets_what_came_before(name, three_seeds, tmp_path):
+    run_dir = shutil.copytree(three_seeds, tmp_path / "run")
     feed = loggers.LoggerFeed((name,), run_dir, directory.read_config(run_dir), 512)
     feed.close(finished=True)
     check(name, run_dir, 0)
@@ -191,7 +173,7 @@ def test_logger_that_is_added_later_gets_what_came_before(name, plain, tmp_path)
 def test_tensorboard_has_configuration_and_curve(logged):
     values = {v.tag: v for event in events(logged, 1) for v in event.summary.value}
     text = values["configuration/text_summary"].tensor.string_val[0].decode()
-    assert "| policy.clip_eps | 0.2 |" in text
+    assert "| gae_lambda | 0.95 |" in text
     assert "| seed | 1 |" in text
     image = values["curve.png"].image
     assert (image.width, image.height) == (960, 600)
@@ -201,21 +183,23 @@ def test_tensorboard_has_configuration_and_curve(logged):
 def test_mlflow_has_configuration_curve_and_status(logged):
     client = mlflow_client(logged)
     found = client.search_runs([client.get_experiment_by_name("dgae_jax").experiment_id])
-    assert sorted(run.info.run_name for run in found) == ["logged-seed-0", "logged-seed-1"]
+    assert sorted(run.info.run_name for run in found) == [f"logged-seed-{i}" for i in range(3)]
     for run in found:
-        assert run.data.params["policy.clip_eps"] == "0.2"
+        assert run.data.params["gae_lambda"] == "0.95"
         assert run.data.params["seed"] == run.info.run_name[-1]
         assert run.info.status == "FINISHED"
 
 
 @needs("wandb")
 def test_wandb_stays_offline_without_login(logged):
-    assert len(list(logged.glob("wandb/offline-run-*/files/media/images/*.png"))) == SEEDS
+    assert (
+        len(list(logged.glob("wandb/offline-run-*/files/media/images/*.png"))) == CONFIG.num_seeds
+    )
 
 
 @pytest.mark.parametrize("at", ["open", "log", "close"])
-def test_failing_logger_costs_one_warning(at, plain, tmp_path, capsys, monkeypatch):
-    run_dir, failing = shutil.copytree(plain, tmp_path / "run"), Mock(id=None)
+def test_failing_logger_costs_one_warning(at, three_seeds, tmp_path, capsys, monkeypatch):
+    run_dir, failing = shutil.copytree(three_seeds, tmp_path / "run"), Mock(id=None)
     opened = Mock(return_value=failing)
     method = opened if at == "open" else getattr(failing, at)
     method.side_effect = ConnectionError("the network is gone\nmore")

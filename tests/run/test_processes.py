@@ -2,7 +2,6 @@
 
 import random
 import shutil
-import signal
 import subprocess
 import sys
 import time
@@ -10,7 +9,7 @@ import time
 import pytest
 
 from tests.helpers import ROOT, TINY
-from tests.runs import last, timeless
+from tests.runs import assert_same, each_signal, last
 
 QUIET = {"cwd": ROOT, "stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
 
@@ -45,35 +44,10 @@ def test_kills_at_random_moments_lose_nothing(tmp_path):
             assert last(killed).read_bytes() == last(whole).read_bytes()
             shutil.rmtree(killed)
     assert start(killed).wait() == 0
-    assert last(killed).read_bytes() == last(whole).read_bytes()
-    assert timeless(killed) == timeless(whole)
+    assert_same(killed, whole)
 
 
-KINDS = [
-    (signal.SIGTERM, 143),
-    pytest.param(signal.SIGINT, 130, marks=pytest.mark.slow),
-    pytest.param(signal.SIGHUP, 129, marks=pytest.mark.slow),
-]
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(("kind", "code"), KINDS)
-def test_signal_saves_a_checkpoint(kind, code, tmp_path):
-    run_dir = tmp_path / "run"
-    rows = run_dir / "metrics.jsonl"
-    words = command("--run-dir", run_dir, "--total-steps", 10**8, *TINY)
-    process = subprocess.Popen(words, cwd=ROOT, text=True, stdout=subprocess.PIPE)
-    while not rows.exists() or not rows.stat().st_size:
-        time.sleep(0.2)
-        assert process.poll() is None
-    process.send_signal(kind)
-    out, _ = process.communicate(timeout=60)
-    assert process.returncode == code
-    assert f"continue with --resume {run_dir}" in out
-    assert last(run_dir).name == f"steps_{timeless(run_dir)[-1]['steps']:012d}.msgpack"
-
-
-@pytest.mark.parametrize(("kind", "code"), KINDS)
+@each_signal
 def test_signal_breaks_off_compilation(kind, code, tmp_path):
     layers = ["8"] * 16  # several seconds of compilation
     run_dir, hidden = tmp_path / "run", ["--policy.hidden", *layers, "--critic.hidden", *layers]

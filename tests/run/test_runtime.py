@@ -18,7 +18,7 @@ from dgae_jax.run import checkpoint, directory, runtime
 from dgae_jax.run.options import RunOptions
 from dgae_jax.run.runtime import Signals, Stopped
 from tests.helpers import ROOT, TINY
-from tests.runs import SMALL, last, stopped_half_way, timeless
+from tests.runs import SMALL, assert_same, stopped_half_way, timeless
 
 FLAGS = [*TINY, "--total-steps", "512", "--checkpoint-every", "256", "--episodes", "1"]
 CACHE = TINY[-2:]
@@ -81,8 +81,7 @@ def test_two_processes_resume_bit_for_bit(two_processes, tmp_path):
     stopped_half_way(two_processes, half)
     for _, err, code in finished(pair("--resume", half, *CACHE)):
         assert code == 0, err
-    assert last(half).read_bytes() == last(two_processes).read_bytes()
-    assert timeless(half) == timeless(two_processes)
+    assert_same(half, two_processes)
 
 
 @pytest.mark.slow
@@ -94,8 +93,7 @@ def test_two_devices_resume_bit_for_bit_and_one_is_refused(two_devices, tmp_path
     assert "not bit-identical (devices 1 (was 2)" in err
     ((_, err, code),) = finished([begun("--resume", half, *CACHE)])
     assert code == 0, err
-    assert last(half).read_bytes() == last(two_devices).read_bytes()
-    assert timeless(half) == timeless(two_devices)
+    assert_same(half, two_devices)
 
 
 @pytest.mark.slow
