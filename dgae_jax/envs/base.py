@@ -16,9 +16,9 @@ __all__ = ["Env", "State", "ThirdPartyEnv", "Wrapper", "brax", "has_limit", "res
 class ThirdPartyEnv(Env):
     """An env with sizes and a range of actions that are known when it is built."""
 
-    observation_size: int = 0  # pyright: ignore[reportIncompatibleMethodOverride, reportAssignmentType]
-    action_size: int = 0  # pyright: ignore[reportIncompatibleMethodOverride, reportAssignmentType]
-    backend: str = ""  # pyright: ignore[reportIncompatibleMethodOverride, reportAssignmentType]
+    observation_size: int = 0  # pyright: ignore
+    action_size: int = 0  # pyright: ignore
+    backend: str = ""  # pyright: ignore
     action_range: tuple[Float[Array, " A"], Float[Array, " A"]]
 
 

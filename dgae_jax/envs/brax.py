@@ -38,4 +38,4 @@ def _replicated(tree: Any, devices: Sequence[Any]) -> Any:
 
 
 for _name in TASKS:
-    brax.envs.register_environment(f"dgae_{_name}", partial(make_env, _name))  # pyright: ignore[reportArgumentType]
+    brax.envs.register_environment(f"dgae_{_name}", partial(make_env, _name))  # pyright: ignore

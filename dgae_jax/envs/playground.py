@@ -37,7 +37,7 @@ class PlaygroundTask(ThirdPartyEnv):
 
     def step(self, state: State, action: Float[Array, " A"]) -> State:
         """Advance one control interval, or as many as the task repeats an action."""
-        return _state(self._env.step(state.pipeline_state, action))  # pyright: ignore[reportArgumentType]
+        return _state(self._env.step(state.pipeline_state, action))  # pyright: ignore
 
 
 def _policy_obs(obs: Any) -> Any:
@@ -54,8 +54,8 @@ def make_playground(name: str, physics: str, **parameters) -> Env:
     require(physics)
     with warnings.catch_warnings(), silence_warnings():
         warnings.simplefilter("ignore")
-        from mujoco_playground import dm_control_suite, registry  # pyright: ignore[reportMissingImports]
-        from mujoco_playground._src.mjx_env import MENAGERIE_PATH  # pyright: ignore[reportMissingImports]
+        from mujoco_playground import dm_control_suite, registry  # pyright: ignore
+        from mujoco_playground._src.mjx_env import MENAGERIE_PATH  # pyright: ignore
 
         if name not in registry.ALL_ENVS:
             near = get_close_matches(name, registry.ALL_ENVS, 3) or dm_control_suite.ALL_ENVS

@@ -160,7 +160,8 @@ class Task(Env):
         position, zero = self._position(physics_state), jnp.zeros((), physics_state.qpos.dtype)
         motion = self._motion_metrics(position, jnp.zeros_like(position))
         metrics = dict.fromkeys(self.TERMS, zero) | motion
-        return State(physics_state, self._observation(physics_state), zero, zero, metrics)  # pyright: ignore[reportArgumentType]
+        obs = self._observation(physics_state)
+        return State(physics_state, obs, zero, zero, metrics)  # pyright: ignore
 
     def _motion_metrics(self, position: Array, velocity: Array) -> dict[str, Array]:
         named, axes = (("position", position), ("velocity", velocity)), "xy"[: self.AXES]

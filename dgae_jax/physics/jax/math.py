@@ -20,7 +20,7 @@ def constant(x: np.ndarray, dtype: jnp.dtype) -> Array:
 
 def dot(a: Float[Array, "*#n K #N"], b: Float[Array, "*#n K #N"]) -> Array:
     """Inner product along the axis before the envs."""
-    return sum(a[..., k, :] * b[..., k, :] for k in range(a.shape[-2]))  # pyright: ignore[reportReturnType]
+    return sum(a[..., k, :] * b[..., k, :] for k in range(a.shape[-2]))  # pyright: ignore
 
 
 def cross(a: Float[Array, "*#n 3 #N"], b: Float[Array, "*#n 3 #N"]) -> Array:
@@ -31,17 +31,19 @@ def cross(a: Float[Array, "*#n 3 #N"], b: Float[Array, "*#n 3 #N"]) -> Array:
 
 def matvec(matrix: Float[Array, "*#n M K #N"], vector: Float[Array, "*#n K #N"]) -> Array:
     """Matrix times vector."""
-    return sum(matrix[..., k, :] * vector[..., None, k, :] for k in range(matrix.shape[-2]))  # pyright: ignore[reportReturnType]
+    terms = (matrix[..., k, :] * vector[..., None, k, :] for k in range(matrix.shape[-2]))
+    return sum(terms)  # pyright: ignore
 
 
 def matmul(a: Float[Array, "*#n M K #N"], b: Float[Array, "*#n K L #N"]) -> Array:
     """Matrix times matrix."""
-    return sum(a[..., :, k, None, :] * b[..., None, k, :, :] for k in range(a.shape[-2]))  # pyright: ignore[reportReturnType]
+    terms = (a[..., :, k, None, :] * b[..., None, k, :, :] for k in range(a.shape[-2]))
+    return sum(terms)  # pyright: ignore
 
 
 def combine(x: Float[Array, "n *k N"], weights: Float[Array, "n N"]) -> Array:
     """Σᵢ xᵢ wᵢ, unrolled: XLA's own reduction costs ten times as much on a CPU."""
-    return sum(x[i] * weights[i] for i in range(len(weights)))  # pyright: ignore[reportReturnType]
+    return sum(x[i] * weights[i] for i in range(len(weights)))  # pyright: ignore
 
 
 def masked_sum(mask: np.ndarray, x: Float[Array, "n *k N"]) -> Float[Array, "m *k N"]:
