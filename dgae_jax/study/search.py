@@ -83,18 +83,16 @@ def space_of(words: Sequence[str], config: ResolvedConfig) -> dict[str, Values]:
     for word in words:
         name, _, text = word.partition("=")
         path = name.replace("-", "_")
-        if path in (*SHARED, "seed", "num_seeds"):
-            message = f"search {word}: cannot be searched: all trials share {path}"
-            raise ConfigError(message, "search")
-        if path in space:
-            raise ConfigError(f"search {word}: {path} is given twice", "search")
         try:
+            if path in (*SHARED, "seed", "num_seeds"):
+                raise ConfigError(f"cannot be searched: all trials share {path}")
+            if path in space:
+                raise ConfigError(f"{path} is given twice")
             space[path] = _values(text)
             for value in space[path].ends:
                 _with_values(config, {path: value})
         except ConfigError as reason:
-            message = f"search {word}: a value is invalid: {reason}"
-            raise ConfigError(message, "search") from None
+            raise ConfigError(f"search {word}: {reason}", "search") from None
         except ValueError:
             forms = "LOW:HIGH, log:LOW:HIGH, int:LOW:HIGH, int:log:LOW:HIGH or VALUE,VALUE"
             raise invalid("search", word, f"SETTING={forms}, with LOW below HIGH") from None
