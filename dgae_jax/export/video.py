@@ -53,7 +53,7 @@ def actors(
 
     if which == "all":
         _, path, config = runs[0]
-        for found in checkpoint.load_all_networks(path, config):
+        for found in reversed(list(checkpoint.networks_in(path, config))):
             samples = int(found.path.stem.removeprefix("steps_"))
             yield [actor(f"after {samples:,} samples", found, config)]
     else:

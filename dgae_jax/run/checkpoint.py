@@ -1,6 +1,6 @@
 """Checkpoints: files of plain data; loading one runs no code.
 
-A file is a line of JSON with schema and SHA-256, then msgpack with the arrays by name and the
+A file is a line of JSON with schema and SHA-256, then Flax's msgpack of the arrays by name and the
 configuration.
 """
 
@@ -8,14 +8,13 @@ import hashlib
 import json
 import re
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
+import flax.serialization
 import jax
 import jax.numpy as jnp
-import msgpack
 import numpy as np
 from jaxtyping import ArrayLike
 
@@ -37,12 +36,6 @@ RENAMED = r"^observations\b"
 
 SCALE = "reward_scale.returns.std"
 """Name of the array that rewards are divided by."""
-
-ARRAY = 1
-"""Msgpack's extension type of an array: shape, name of the dtype and bytes, as Flax writes it."""
-
-MAX_ARRAYS = 10_000
-"""Most arrays in a file; containers that are larger are refused before they take memory."""
 
 
 class CheckpointError(ConfigError):
@@ -95,17 +88,10 @@ def save(
 
 def write(path: Path, config: ResolvedConfig, arrays: dict[str, np.ndarray]) -> None:
     """Write arrays by name and their configuration atomically."""
-
-    def pack(value: Any) -> bytes:
-        return msgpack.packb(value)  # pyright: ignore[reportReturnType]
-
-    packed = {
-        name: msgpack.ExtType(ARRAY, pack((x.shape, x.dtype.name, x.tobytes())))
-        for name, x in arrays.items()
-    }
-    body = pack({"arrays": packed, "config": json.dumps(to_dict(config), allow_nan=False)})
+    parts = {"arrays": arrays, "config": json.dumps(to_dict(config), allow_nan=False)}
+    body = flax.serialization.msgpack_serialize(parts)
     header = {"schema": SCHEMA, "sha256": hashlib.sha256(body).hexdigest()}
-    files.replace(path, json.dumps(header, allow_nan=False).encode() + b"\n" + body)
+    files.replace(path, json.dumps(header).encode() + b"\n" + body)
 
 
 def file_name(steps: int) -> str:
@@ -114,9 +100,8 @@ def file_name(steps: int) -> str:
 
 
 def checkpoints_in(directory: Path) -> list[Path]:
-    """Return the checkpoints in a directory, oldest first; no link is followed."""
-    named = (p for p in directory.glob("*") if re.fullmatch(r"steps_\d{12}\.msgpack", p.name))
-    return sorted(p for p in named if p.is_file() and not p.is_symlink())
+    """Return the checkpoints in a directory, oldest first."""
+    return sorted(directory.glob(f"steps_{12 * '[0-9]'}.msgpack"))
 
 
 def not_finite(arrays: dict[str, np.ndarray]) -> list[str]:
@@ -125,84 +110,64 @@ def not_finite(arrays: dict[str, np.ndarray]) -> list[str]:
     Networks, optimizers and running statistics must be finite. Envs (`episodes`) need not: the
     last return is NaN before the first, and an env may be kept for replay as it turned non-finite.
     """
-    checked = {name: x for name, x in arrays.items() if not name.startswith("episodes.")}
-    inexact = [name for name, x in checked.items() if jnp.issubdtype(x.dtype, jnp.inexact)]
-    return [name for name in inexact if not np.isfinite(arrays[name]).all()]
+    checked = (name for name in arrays if not name.startswith("episodes."))
+    return [name for name in checked if not np.isfinite(arrays[name]).all()]
 
 
-def config_of(path: Path) -> ResolvedConfig:
-    """Return the configuration in a checkpoint; raises as `load`."""
-    _, text = _read(path)
-    with _decoding(path):
-        try:
-            return resolve(from_dict(json.loads(text)))
-        except ConfigError as reason:
-            raise CheckpointError(f"{path}: is of another version ({reason})") from reason
-
-
-def load(path: Path, like: T) -> T:
-    """Return the arrays in a checkpoint or policy file, which may hold more, as a tree like `like`.
+def read(path: Path) -> tuple[ResolvedConfig, dict[str, Any]]:
+    """Return the configuration in a checkpoint or policy file, and its arrays by name.
 
     Raises:
         DamagedError: the file cannot be read whole.
-        CheckpointError: an array is missing, or of another type or shape.
-        NotFiniteError: there is a NaN or infinity where `not_finite` allows none.
+        CheckpointError: it is of another version.
     """
-    want = jax.eval_shape(_by_name, like)
-    packed, _ = _read(path)
-    for name in sorted(want.keys() - packed.keys()):
-        raise CheckpointError(f"{path}: is of another run, {name} is missing")
-    got = {name: _array(path, name, packed[name], x) for name, x in want.items()}
-    for name in not_finite(got):
-        raise NotFiniteError(f"{path}: {name} is not finite, so it cannot be used")
-
-    def restored(at, like):
-        leaf = jnp.asarray(got[_name(at)])
-        return jax.random.wrap_key_data(leaf) if _is_key(like) else leaf
-
-    return jax.tree.map_with_path(restored, like)
-
-
-def _read(path: Path) -> tuple[dict[str, Any], str]:
-    """Check the checksum and return packed arrays by name, and the configuration."""
-    with _decoding(path):
+    try:
         line, _, body = path.read_bytes().partition(b"\n")
         header = json.loads(line)
-        schema, checksum = header["schema"], header["sha256"]
-        if type(schema) is not int:
-            raise ValueError
-        if schema not in READABLE:
-            raise CheckpointError(f"{path}: has schema {schema}, must be 3 or {SCHEMA}")
-        if hashlib.sha256(body).hexdigest() != checksum:
+        if header["schema"] not in READABLE:
+            raise CheckpointError(f"{path}: has schema {header['schema']}, must be 3 or {SCHEMA}")
+        if hashlib.sha256(body).hexdigest() != header["sha256"]:
             raise DamagedError(f"{path}: is damaged (its checksum differs)")
-        found: Any = msgpack.unpackb(body, max_array_len=0, max_map_len=MAX_ARRAYS)
-        packed = {re.sub(RENAMED, "obs_stats", name): x for name, x in found["arrays"].items()}
-        return packed, found["config"]
-
-
-def _array(path: Path, name: str, packed: Any, like: Any) -> np.ndarray:
-    """Decode an array; its type and shape are compared before its bytes become numbers."""
-    with _decoding(path):
-        if packed.code != ARRAY:
-            raise ValueError
-        shape, dtype, data = msgpack.unpackb(packed.data, max_array_len=32, max_map_len=0)
-        if (tuple(shape), dtype) != (like.shape, like.dtype.name):
-            found, here = f"{dtype}{tuple(shape)}"[:100], f"{like.dtype}{like.shape}"
-            raise CheckpointError(f"{path}: is of another run, {name} is {found}, here {here}")
-        return np.frombuffer(data, like.dtype).reshape(like.shape)
-
-
-@contextmanager
-def _decoding(path: Path) -> Iterator[None]:
-    """Refuse a file that cannot be decoded; a hostile one makes the decoder raise many kinds."""
-    try:
-        yield
+        found: Any = flax.serialization.msgpack_restore(body)
+        arrays = {re.sub(RENAMED, "obs_stats", name): x for name, x in found["arrays"].items()}
+        settings = json.loads(found["config"])
     except CheckpointError:
         raise
     except OSError as reason:
         raise DamagedError(f"{path}: cannot be read ({reason.strerror})") from reason
-    except Exception as reason:
+    except Exception as reason:  # a hostile file makes the decoders raise many kinds
         raise DamagedError(f"{path}: is damaged ({type(reason).__name__})") from reason
+    try:
+        return resolve(from_dict(settings)), arrays
+    except ConfigError as reason:
+        raise CheckpointError(f"{path}: is of another version ({reason})") from reason
+
+
+def load(path: Path, like: T, config: ResolvedConfig) -> T:
+    """Return the arrays in a checkpoint or policy file, which may hold more, as a tree like `like`.
+
+    Raises:
+        CheckpointError: as `read`; or it is of another run than `config`, or lacks an array.
+        NotFiniteError: there is a NaN or infinity where `not_finite` allows none.
+    """
+    written, arrays = read(path)
+    for name, (here, there) in differences(config, written).items():
+        if name not in MAY_CHANGE:  # the arrays may have the same shapes
+            raise CheckpointError(f"{path}: is of another run, its {name} is {there}, here {here}")
+    wanted = jax.eval_shape(_by_name, like)
+    for name, x in wanted.items():
+        found, here = arrays.get(name), f"{x.dtype}{x.shape}"
+        there = f"{found.dtype}{found.shape}" if isinstance(found, np.ndarray) else "missing"
+        if there != here:
+            raise CheckpointError(f"{path}: is of another run, {name} is {there}, here {here}")
+    for name in not_finite({name: arrays[name] for name in wanted}):
+        raise NotFiniteError(f"{path}: {name} is not finite, so it cannot be used")
+
+    def restored(at, like):
+        leaf = jnp.asarray(arrays[_name(at)])
+        return jax.random.wrap_key_data(leaf) if _is_key(like) else leaf
+
+    return jax.tree.map_with_path(restored, like)
 
 
 def _is_key(x: Any) -> bool:
@@ -221,17 +186,12 @@ def _name(path) -> str:
 
 def latest_train_state(run_dir: Path, config: ResolvedConfig) -> tuple[TrainState, Path]:
     """Return the latest whole checkpoint and its file; raise CheckpointError if there is none."""
-    return next(_readable(run_dir, lambda path: (load_train_state(path, config), path)))
-
-
-def load_train_state(path: Path, config: ResolvedConfig) -> TrainState:
-    """Return the training state in one file; raises as `load`."""
-    _check_run(path, config)
-    return load(path, _abstract_state(config))
+    like = _abstract_state(config)
+    return next(_readable(run_dir, lambda path: (load(path, like, config), path)))
 
 
 def load_networks(source: Path, config: ResolvedConfig, which: str) -> Networks:
-    """Return the networks of a run directory or a policy file; nothing else in it is read.
+    """Return the networks of a run directory or a policy file; nothing else in it is checked.
 
     Raises:
         ConfigError: the best is asked for and nothing was evaluated.
@@ -239,21 +199,23 @@ def load_networks(source: Path, config: ResolvedConfig, which: str) -> Networks:
     """
     if which not in ("latest", "best"):
         raise invalid("checkpoint", which, "one of latest, best")
+    path = source
     if source.is_file():
         if which != "latest":
             raise invalid("checkpoint", which, f"latest: {source} is a single one")
-        return _load_networks(source, config)
-    if which == "latest":
-        return next(_readable(source, partial(_load_networks, config=config)))
-    steps = EvaluationsFile(source / "evaluations.jsonl").best
-    if steps is None:
-        raise invalid("checkpoint", which, f"latest: {source} has no evaluations")
-    return _load_networks(source / "checkpoints" / file_name(steps), config)
+    elif which == "latest":
+        return next(networks_in(source, config))
+    else:
+        steps = EvaluationsFile(source / "evaluations.jsonl").best
+        if steps is None:
+            raise invalid("checkpoint", which, f"latest: {source} has no evaluations")
+        path = source / "checkpoints" / file_name(steps)
+    return _load_networks(path, config)
 
 
-def load_all_networks(run_dir: Path, config: ResolvedConfig) -> list[Networks]:
-    """Return the networks of every checkpoint, oldest first; raises as `latest_train_state`."""
-    return list(_readable(run_dir, partial(_load_networks, config=config)))[::-1]
+def networks_in(run_dir: Path, config: ResolvedConfig) -> Iterator[Networks]:
+    """Yield the networks of every checkpoint, latest first; raise as `latest_train_state`."""
+    return _readable(run_dir, partial(_load_networks, config=config))
 
 
 def reward_std(path: Path, config: ResolvedConfig) -> np.ndarray:
@@ -264,10 +226,11 @@ def reward_std(path: Path, config: ResolvedConfig) -> np.ndarray:
     """
     if not config.normalize_rewards:
         return np.ones(config.num_seeds)
-    if SCALE not in _read(path)[0]:
+    if SCALE not in read(path)[1]:
         hint = "dgae refit fits a critic that does"
         raise CheckpointError(f"{path}: lacks the scale of rewards; {hint}")
-    return np.asarray(load(path, {SCALE: _abstract_state(config).reward_scale.returns.std})[SCALE])
+    like = {SCALE: _abstract_state(config).reward_scale.returns.std}
+    return np.asarray(load(path, like, config)[SCALE])
 
 
 def reset_episodes(state: TrainState, config: ResolvedConfig) -> TrainState:
@@ -288,18 +251,10 @@ def save_networks(path: Path, config: ResolvedConfig, networks: Networks, std: A
 
 
 def _load_networks(path: Path, config: ResolvedConfig) -> Networks:
-    _check_run(path, config)
     policy, critic, stats, *_ = _abstract_state(config)
     like = {"policy.params": policy.params, "critic.params": critic.params, "obs_stats": stats}
-    policy, critic, stats = map(load(path, like).get, like)
+    policy, critic, stats = map(load(path, like, config).get, like)
     return Networks(InferenceState(policy, stats), InferenceState(critic, stats), path)
-
-
-def _check_run(path: Path, config: ResolvedConfig) -> None:
-    """Refuse a checkpoint of another run; its arrays may have the same shapes."""
-    for name, (ours, theirs) in differences(config, config_of(path)).items():
-        if name not in MAY_CHANGE:
-            raise CheckpointError(f"{path}: is of another run, its {name} is {theirs}, here {ours}")
 
 
 def _abstract_state(config: ResolvedConfig) -> TrainState:

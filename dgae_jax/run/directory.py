@@ -118,7 +118,7 @@ def config_of(source: Path) -> ResolvedConfig:
         return read_config(source)
     from dgae_jax.run import checkpoint
 
-    return checkpoint.config_of(source)
+    return checkpoint.read(source)[0]
 
 
 def read_config(path: Path) -> ResolvedConfig:

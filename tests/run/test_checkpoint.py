@@ -1,7 +1,7 @@
 """Checkpoints: round trip, damage, other runs, networks alone."""
 
 import dataclasses
-import tracemalloc
+import json
 
 import chex
 import jax
@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from dgae_jax.configs.config import ConfigError
+from dgae_jax.configs.serial import to_dict
 from dgae_jax.run import checkpoint, files
 from dgae_jax.run.checkpoint import CheckpointError, NotFiniteError
 from tests.helpers import signed
@@ -26,11 +27,11 @@ def plain(state):
 
 def test_state_comes_back_bit_for_bit(state, tmp_path):
     path = saved(state, tmp_path, 0)
-    loaded = checkpoint.load(path, state)
+    loaded = checkpoint.load(path, state, SMALL)
     assert np.isnan(loaded.episodes.last_total).all()  # as before the first return
     chex.assert_trees_all_equal(plain(loaded), plain(state))
     chex.assert_trees_all_equal_shapes_and_dtypes(loaded, state)
-    assert checkpoint.config_of(path) == SMALL
+    assert checkpoint.read(path)[0] == SMALL
 
 
 def schema(number):
@@ -43,7 +44,6 @@ def schema(number):
         (lambda b: b[:100], "is damaged"),
         (lambda b: b[:-9] + b"x" + b[-8:], "is damaged"),
         (lambda b: signed(b"\x93\x01\xa1a\x02"), "is damaged"),
-        (schema("true"), "is damaged"),
         (schema(5), "has schema 5, must be 3 or 4"),
         (schema(2), "has schema 2, must be 3 or 4"),
         (
@@ -56,47 +56,37 @@ def test_damaged_file_is_refused(damage, reason, state, tmp_path):
     path = saved(state, tmp_path, 64)
     path.write_bytes(damage(path.read_bytes()))
     with pytest.raises(CheckpointError, match=f"{path.name}: {reason}"):
-        checkpoint.load(path, state)
+        checkpoint.load(path, state, SMALL)
 
 
 def array(shape=(2,), dtype="float32", data=bytes(8)):
-    return msgpack.ExtType(checkpoint.ARRAY, msgpack.packb((shape, dtype, data)))
+    return msgpack.ExtType(1, msgpack.packb((shape, dtype, data)))
 
 
 @pytest.mark.parametrize(
     ("value", "reason"),
     [
-        # np.asarray makes 15,001 × 100,000 characters of 4 bytes of it: 6 GB
-        (["x" * 100_000, *[""] * 15_000], "is damaged"),
-        ("x", "is damaged"),
-        (msgpack.ExtType(2, b"x"), "is damaged"),
-        (array(shape=(2**40,)), r"a is float32\(1099511627776,\), here float32\(2,\)"),
-        (array(shape=[[[]] * 50_000]), "is damaged"),
-        (array(dtype="<U100000"), r"a is <U100000\(2,\), here float32\(2,\)"),
-        (array(dtype="object"), r"a is object\(2,\), here float32\(2,\)"),
-        (array(data=bytes(4)), "is damaged"),
+        (["x", 1], "a is missing"),
+        (array(shape=(1, 2)), r"a is float32\(1, 2\), here float32\(2,\)"),
+        (array(dtype="int32"), r"a is int32\(2,\), here float32\(2,\)"),
+        (array(shape=(2**40,)), "is damaged"),
+        (array(dtype="object"), "is damaged"),
         (array(data=[0] * 10_000), "is damaged"),
     ],
 )
-def test_hostile_array_is_refused_before_it_takes_memory(value, reason, tmp_path):
-    data = signed(msgpack.packb({"arrays": {"a": value}, "config": "{}"}))
+def test_array_that_was_not_written_so_is_refused(value, reason, tmp_path):
     path = tmp_path / "steps_000000000000.msgpack"
-    path.write_bytes(data)
-    tracemalloc.start()
-    try:
-        with pytest.raises(CheckpointError, match=reason):
-            checkpoint.load(path, {"a": np.zeros(2, np.float32)})
-        _, peak = tracemalloc.get_traced_memory()
-    finally:
-        tracemalloc.stop()
-    assert peak < 20 * len(data) + 2**22
+    config = json.dumps(to_dict(SMALL))
+    path.write_bytes(signed(msgpack.packb({"arrays": {"a": value}, "config": config})))
+    with pytest.raises(CheckpointError, match=reason):
+        checkpoint.load(path, {"a": np.zeros(2, np.float32)}, SMALL)
 
 
 def test_part_is_loaded_without_the_rest(tmp_path):
     a, c = np.ones(2, np.float32), np.arange(3, dtype=np.int32)
     path = tmp_path / "x.msgpack"
     checkpoint.write(path, SMALL, {"a": a, "b": np.full(3, np.nan), "c": c})
-    chex.assert_trees_all_equal(checkpoint.load(path, {"a": a, "c": c}), {"a": a, "c": c})
+    chex.assert_trees_all_equal(checkpoint.load(path, {"a": a, "c": c}, SMALL), {"a": a, "c": c})
 
 
 @pytest.mark.parametrize(
@@ -111,7 +101,7 @@ def test_nonfinite_state_is_neither_saved_nor_loaded(where, value, state, tmp_pa
     assert list(tmp_path.iterdir()) == []
     checkpoint.write(path, SMALL, arrays)
     with pytest.raises(NotFiniteError, match=rf"{path.name}: {where}\S* is not finite"):
-        checkpoint.load(path, state)
+        checkpoint.load(path, state, SMALL)
 
 
 def test_latest_and_best_checkpoints_stay(state, tmp_path):
@@ -128,11 +118,11 @@ def test_checkpoint_of_another_run_is_refused(state, tmp_path):
     path = saved(state, tmp_path, 64)
     other = r"its env_version is v4, here v5"  # arrays of the same shapes
     with pytest.raises(CheckpointError, match=f"{path.name}: is of another run, {other}"):
-        checkpoint.load_train_state(path, dataclasses.replace(SMALL, env_version="v5"))
-    checkpoint.load_train_state(path, dataclasses.replace(SMALL, total_steps=9999, physics="jax"))
+        checkpoint.load(path, state, dataclasses.replace(SMALL, env_version="v5"))
+    checkpoint.load(path, state, dataclasses.replace(SMALL, total_steps=9999, physics="jax"))
     path.write_bytes(signed(path.read_bytes().partition(b"\n")[2].replace(b"gamma", b"gemma")))
     with pytest.raises(CheckpointError, match=r"is of another version \(gamma: missing\)"):
-        checkpoint.load_train_state(path, SMALL)
+        checkpoint.load(path, state, SMALL)
 
 
 def test_damaged_checkpoint_falls_back_to_older_one(state, tmp_path, capsys):
@@ -140,12 +130,11 @@ def test_damaged_checkpoint_falls_back_to_older_one(state, tmp_path, capsys):
     directory.mkdir()
     whole, damaged = (saved(state, directory, steps) for steps in (64, 128))
     damaged.write_bytes(damaged.read_bytes()[:-1])
-    (directory / "steps_000000000192.msgpack").symlink_to(whole)  # not followed
     _, path = checkpoint.latest_train_state(tmp_path, SMALL)
     assert path == whole
     why = f"{damaged}: is damaged (its checksum differs)"
     assert capsys.readouterr().err == f"warning: {why}; skipped\n"
-    assert [found.path for found in checkpoint.load_all_networks(tmp_path, SMALL)] == [whole]
+    assert [found.path for found in checkpoint.networks_in(tmp_path, SMALL)] == [whole]
     whole.unlink()
     with pytest.raises(CheckpointError, match="must hold a whole checkpoint"):
         checkpoint.latest_train_state(tmp_path, SMALL)
