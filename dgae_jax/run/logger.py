@@ -37,7 +37,7 @@ class RunLogger:
         self.evaluations = EvaluationsFile(run_dir / "evaluations.jsonl")
         self.evaluations.cut(done * config.samples_per_iteration, config.num_seeds)
         names = options.log if jax.process_index() == 0 else ()
-        self.feed = LoggerFeed(names, run_dir, config, self.steps)
+        self.feed = LoggerFeed(names, run_dir, config)
         self.page = terminal.Page(self.picture) if terminal.in_notebook() else None
         self.began = time.monotonic() - self.metrics.seconds
         self.thread, self.pending = ThreadPoolExecutor(1), Future()
@@ -69,7 +69,7 @@ class RunLogger:
     def append(self, state: TrainState, measured: dict[str, Any], count: int) -> float | None:
         """Add `count` iterations to the metrics and return the last mean return, if any."""
         rows = self.metrics.append(measured, count, time.monotonic() - self.began)
-        self.feed.update()
+        self.feed.log(rows)
         if self.options.debug_nonfinite:
             for seed in sorted({row["seed"] for row in rows if row["nonfinite"]}):
                 self._save_incidents(state, seed)
@@ -90,8 +90,7 @@ class RunLogger:
         result = evaluate_policies(policies, self.config, **how, watch=watch)
         if not self.evaluated:
             self.pending.result()  # the checkpoint is on the disk before its evaluation
-            self.evaluations.append(self.steps, result)
-            self.feed.update()
+            self.feed.log(self.evaluations.append(self.steps, result))
         self.draw()
         return result
 

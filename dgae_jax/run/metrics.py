@@ -110,12 +110,14 @@ class EvaluationsFile:
         """Return whether the state after `steps` samples was evaluated."""
         return any(row["steps"] == steps for row in self.rows)
 
-    def append(self, steps: int, result: dict[str, Any]) -> None:
-        """Append an evaluation after `steps` samples; non-finite returns do not count."""
+    def append(self, steps: int, result: dict[str, Any]) -> list[dict[str, Any]]:
+        """Append an evaluation after `steps` samples; return its rows with finite returns."""
         kept = "seed", "return_mean", "return_std", "returns"
         rows = [{"steps": steps, **{k: one[k] for k in kept}} for one in result["seeds"]]
         files.append_rows(self.path, rows)
-        self.rows += [row for row in rows if _is_evaluation(row)]
+        counted = [row for row in rows if _is_evaluation(row)]
+        self.rows += counted
+        return counted
 
     def points(self) -> np.ndarray:
         """Return steps, mean and standard deviation of every row [E, 3]."""
