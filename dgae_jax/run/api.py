@@ -4,7 +4,7 @@ import dataclasses
 import shutil
 import tempfile
 from pathlib import Path
-from typing import Any, Literal, NamedTuple, Unpack
+from typing import Any, Literal, NamedTuple
 
 import jax
 import numpy as np
@@ -16,7 +16,7 @@ from dgae_jax.envs.registry import custom_env
 from dgae_jax.learn.build import make_greedy, make_quantiles, make_task
 from dgae_jax.learn.types import InferenceState
 from dgae_jax.run import checkpoint, directory, metrics, terminal, training
-from dgae_jax.run.options import RunOptions, TrainOptions
+from dgae_jax.run.options import RunOptions
 from dgae_jax.run.training import RunError
 
 
@@ -75,7 +75,7 @@ def train(
     *,
     env: Env | None = None,
     quiet: bool = False,
-    **options: Unpack[TrainOptions],
+    **options: Any,
 ) -> Run:
     """Train and evaluate a run, as the command line does.
 
@@ -99,9 +99,9 @@ def train(
     try:
         with terminal.silenced(quiet), custom_env(env) as name:
             config = config if name is None else dataclasses.replace(config, env=name)
-            done = training.train(resolve(config), RunOptions(run_dir=path, **options))
+            evaluation, _ = training.train(resolve(config), RunOptions(run_dir=path, **options))
             policy, rows = load_policy(path, env=env), metrics.read(path / "metrics.jsonl")
-            return Run(policy, rows, done.evaluation, directory)
+            return Run(policy, rows, evaluation, directory)
     except RunError:
         directory = path  # a run can continue there
         raise

@@ -13,27 +13,20 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
-from functools import cache
 from pathlib import Path
 from typing import IO, Any
 
 from dgae_jax.configs.config import ConfigError, invalid
 from dgae_jax.configs.resolved import ResolvedConfig, resolve
 from dgae_jax.configs.serial import from_dict, to_dict
-from dgae_jax.run import files, options, terminal
-from dgae_jax.run.options import RunOptions
+from dgae_jax.run import files, terminal
+from dgae_jax.run.options import SAVED, RunOptions
 
 VERSIONED = (
     "dgae_jax", "jax", "jaxlib", "flax", "optax", "brax", "mujoco", "mujoco-mjx", "playground",
     "gymnasium", "numpy",
 )  # fmt: skip
 """Packages to record the versions of."""
-
-OWN = (
-    "config.json", "manifest.json", "metrics.jsonl", "evaluations.jsonl", "sinks.json",
-    "checkpoints", "nonfinite", "tensorboard", "wandb", "mlflow",
-)  # fmt: skip
-"""Files and directories that may be no links or devices."""
 
 
 class InUseError(ConfigError):
@@ -122,15 +115,14 @@ def config_of(source: Path) -> ResolvedConfig:
 
 
 def read_config(path: Path) -> ResolvedConfig:
-    """Return the configuration of a run directory; raise ConfigError if it has links or devices."""
+    """Return the configuration of a run directory; raise ConfigError if it has links or pipes."""
     with _must_be("a run directory", path):
         if not path.is_dir():
             there = "a file" if path.exists() else "nothing"
             raise ConfigError(f"{path}: must be a run directory; there is {there} of that name")
-    with contextlib.suppress(OSError):  # what cannot be read is missed by those who need it
-        for own in [*(path / name for name in OWN), *path.glob("checkpoints/steps_*")]:
-            if own.is_symlink() or (own.exists() and not (own.is_file() or own.is_dir())):
-                raise ConfigError(f"{own}: must be in the run directory itself, not a link or pipe")
+        for each in [*path.iterdir(), *path.glob("checkpoints/*")]:
+            if each.is_symlink() or each.is_fifo():
+                raise ConfigError(f"{each}: must be a file or directory, not a link or pipe")
     return read_config_file(path / "config.json")
 
 
@@ -151,46 +143,36 @@ def write_config(path: Path, config: ResolvedConfig) -> None:
 
 def extend_manifest(run_dir: Path, options: RunOptions) -> None:
     """Add the part that resumes a run to `manifest.json`."""
-    before, parts = _parts(run_dir)
-    resumed = [*parts[1:], _part(options)]
+    before = files.read_object(run_dir / "manifest.json")
+    resumed = [*before.get("resumed", []), _part(options)]
     files.write_json(run_dir / "manifest.json", {**before, "resumed": resumed})
 
 
 def saved_options(run_dir: Path) -> RunOptions:
-    """Return the options of the last part of the run, as far as they can be read."""
-    return options.read_options(last_part(run_dir).get("options"))
+    """Return the options of the last part of the run that a resume keeps."""
+    found = last_part(run_dir).get("options", {})
+    return RunOptions(**{name: found[name] for name in SAVED if name in found})
 
 
 def environment_changes(run_dir: Path, options: RunOptions) -> list[str]:
     """Return what the bits of a result depend on and is not what it was, with both values."""
-    was, now = _environment(last_part(run_dir)), _environment(_part(options))
-    changed = ((name, value) for name, value in now.items() if was.get(name) != value)
-    return [f"{name} {value} (was {was.get(name)})" for name, value in changed]
-
-
-def _environment(part: dict[str, Any]) -> dict[str, Any]:
-    found = {name: part.get(name) for name in ("device", "cores", "processes", "git_revision")}
-    settings, versions, options = (
-        table if isinstance(table := part.get(name), dict) else {}
-        for name in ("settings", "versions", "options")
-    )
-    return {**found, **settings, **versions, "devices": options.get("devices")}
+    was, now = last_part(run_dir), _part(options)
+    names = ("device", "cores", "processes", "git_revision")
+    pairs = [(name, was.get(name), now[name]) for name in names]
+    for table in ("settings", "versions"):
+        before = was.get(table, {})
+        pairs += [(name, before.get(name), value) for name, value in now[table].items()]
+    pairs.append(("devices", was.get("options", {}).get("devices"), options.devices))
+    return [f"{name} {new} (was {old})" for name, old, new in pairs if new != old]
 
 
 def last_part(run_dir: Path) -> dict[str, Any]:
     """Return the last part of the manifest; empty if it cannot be read."""
-    part = _parts(run_dir)[1][-1]
-    return part if isinstance(part, dict) else {}
-
-
-def _parts(run_dir: Path) -> tuple[dict[str, Any], list[Any]]:
-    """Return the manifest and its parts: itself, and those that resumed the run."""
     manifest = files.read_object(run_dir / "manifest.json")
-    resumed = manifest.get("resumed")
-    return manifest, [manifest, *(resumed if isinstance(resumed, list) else [])]
+    return [manifest, *manifest.get("resumed", [])][-1]
 
 
-def _part(chosen: RunOptions) -> dict[str, Any]:
+def _part(options: RunOptions) -> dict[str, Any]:
     from dgae_jax.run import runtime  # JAX is loaded when a run begins
 
     return {
@@ -201,11 +183,10 @@ def _part(chosen: RunOptions) -> dict[str, Any]:
         "platform": platform.platform(),
         **runtime.hardware(),
         "versions": {name: _version(name) for name in VERSIONED},
-        "options": options.saved_options(chosen),
+        "options": {name: getattr(options, name) for name in SAVED},
     }
 
 
-@cache
 def _version(name: str) -> str | None:
     try:
         return importlib.metadata.version(name)
@@ -213,7 +194,6 @@ def _version(name: str) -> str | None:
         return None
 
 
-@cache
 def _git_revision() -> str | None:
     """Return the commit, `+` appended where files differ from it; None outside a checkout."""
     folder, file = Path(__file__).parent, Path(__file__).name

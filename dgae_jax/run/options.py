@@ -3,7 +3,6 @@
 import importlib.util
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TypedDict
 
 from dgae_jax.configs.config import ConfigError, invalid
 from dgae_jax.configs.resolved import ResolvedConfig
@@ -58,38 +57,13 @@ class RunOptions:
         object.__setattr__(self, "log", tuple(dict.fromkeys(self.log)))  # perhaps a list
 
 
-class SavedOptions(TypedDict, total=False):
-    """Options that a resumed run keeps."""
+SAVED = (
+    *("devices", "checkpoint_every", "keep_checkpoints", "max_nonfinite"),
+    *("eval_engine", "episodes", "debug_nonfinite", "log"),
+)
+"""Options that a resumed run keeps."""
 
-    devices: int | None
-    checkpoint_every: int
-    keep_checkpoints: int
-    max_nonfinite: int
-    eval_engine: str | None
-    episodes: int
-    debug_nonfinite: bool
-    log: tuple[str, ...]
-
-
-class TrainOptions(SavedOptions, total=False):
-    """Keyword options of `dgae_jax.train`: fields of `RunOptions`."""
-
-    cache_dir: str
-    coordinator: str | None
-    num_processes: int | None
-    process_id: int | None
-    resume_or_start: bool
-    inexact: bool
-
-
-INTEGER_RANGES = {
-    "devices": (1, 100_000, "in one machine"),
-    "checkpoint_every": (1, 2**31 - 1, "samples are counted in an int32"),
-    "keep_checkpoints": (1, 1_000_000, "files in one directory"),
-    "max_nonfinite": (1, 2**31 - 1, "iterations are counted in an int32"),
-    "episodes": (1, 10_000, "they are played side by side"),
-}
-"""Smallest and largest value of each whole number, and why not more."""
+COUNTS = ("devices", "checkpoint_every", "keep_checkpoints", "max_nonfinite", "episodes")
 
 
 def engines_of(config: ResolvedConfig) -> tuple[str, ...]:
@@ -118,10 +92,10 @@ def eval_env_id(config: ResolvedConfig) -> str:
 def validate_options(options: RunOptions, config: ResolvedConfig) -> None:
     """Raise ConfigError for the first option that is invalid in a run of `config`."""
     engine_of(config, options.eval_engine, "eval_engine")
-    for name, (low, high, reason) in INTEGER_RANGES.items():
+    for name in COUNTS:
         value = getattr(options, name)
-        if value is not None and not (type(value) is int and low <= value <= high):
-            raise invalid(name, value, f"a whole number from {low:,} to {high:,} ({reason})")
+        if value is not None and not (type(value) is int and 1 <= value < 2**31):
+            raise invalid(name, value, f"a whole number from 1 to {2**31 - 1:,}")
     for name in options.log:
         if name not in METRIC_LOGGERS:
             raise invalid("log", name, f"one or more of {', '.join(METRIC_LOGGERS)}")
@@ -137,18 +111,3 @@ def validate_options(options: RunOptions, config: ResolvedConfig) -> None:
         raise invalid("resume_or_start", True, "used with --run-dir DIR")
     if options.inexact and options.resume is None and not options.resume_or_start:
         raise ConfigError("inexact: needs --resume or --resume-or-start", "inexact")
-
-
-def saved_options(options: RunOptions) -> dict[str, Any]:
-    """Return the options that a resumed run keeps, as plain data for JSON."""
-    saved = {name: getattr(options, name) for name in SavedOptions.__annotations__}
-    return saved | {"log": list(options.log)}
-
-
-def read_options(data: Any) -> RunOptions:
-    """Return the options that `saved_options` wrote; values of other types are left out."""
-    found: dict[str, Any] = data if isinstance(data, dict) else {}
-    usual = saved_options(RunOptions(devices=1, eval_engine=""))
-    kept = {name: found[name] for name, x in usual.items() if type(found.get(name)) is type(x)}
-    log = tuple(name for name in METRIC_LOGGERS if name in kept.get("log", []))
-    return RunOptions(**{**kept, "log": log})

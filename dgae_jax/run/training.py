@@ -7,7 +7,7 @@ import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import numpy as np
@@ -53,16 +53,9 @@ class DivergedError(RunError):
     """A run with updates or envs that are no longer finite, because of its hyperparameters."""
 
 
-class Finished(NamedTuple):
-    """A run that reached its end."""
-
-    evaluation: dict[str, Any]
-    directory: Path
-
-
 def train(
     config: ResolvedConfig, options: RunOptions, on_eval: EvalCallback | None = None
-) -> Finished:
+) -> tuple[dict[str, Any], Path]:
     """Train, evaluate and write a run directory, new or continued.
 
     Args:
@@ -70,6 +63,9 @@ def train(
         options: `resume` continues the run in that directory bit for bit; `resume_or_start`
             continues the run in `run_dir` if there is one; otherwise a new run starts.
         on_eval: called at every periodic evaluation.
+
+    Returns:
+        What `evaluation.json` holds, and the run directory.
 
     Raises:
         ConfigError: invalid options or paths, or a changed machine; nothing is written.
@@ -103,7 +99,7 @@ def train(
                 with Reporter(page=logger.page) as reporter:
                     evaluation = logger.evaluate(state, signals.watching(reporter.watch))
             files.write_json(run_dir / "evaluation.json", evaluation)
-        return Finished(evaluation, run_dir)
+        return evaluation, run_dir
 
 
 def train_command(config: ResolvedConfig, options: RunOptions) -> int:
@@ -112,7 +108,7 @@ def train_command(config: ResolvedConfig, options: RunOptions) -> int:
     The process ends here where Python would wait for XLA, or JAX print a task's failure again.
     """
     try:
-        finished = train(config, options)
+        evaluation, run_dir = train(config, options)
     except RunError as end:
         if jax.process_index() == 0:
             (terminal.say if end.exit_code > 128 else terminal.warn)(str(end))
@@ -120,7 +116,7 @@ def train_command(config: ResolvedConfig, options: RunOptions) -> int:
             os._exit(end.exit_code)
         return end.exit_code
     with terminal.silenced(jax.process_index() > 0):
-        terminal.say(f"{describe(finished.evaluation)}; files in {finished.directory}")
+        terminal.say(f"{describe(evaluation)}; files in {run_dir}")
     return 0
 
 
@@ -226,8 +222,7 @@ def _iterate(
             state = trainer.init(config, seed_keys(config))
         if done < config.iterations:
             compile_in_thread(trainer.dispatch, config, state, 1, watch=watch)
-        failures = runtime.gather(state.failures)
-        most, count, seconds = failures.max(), 1, 0.0
+        most, count, seconds = runtime.gather(state.failures).max(), 1, 0.0
         stopping = signals.anywhere()
         while True:
             if most >= options.max_nonfinite:
@@ -247,7 +242,7 @@ def _iterate(
             state, measured = trainer.dispatch(config, state, count)
             measured = runtime.gather(measured)
             mean_return = logger.append(state, measured, count)
-            failures, most = _count_failures(failures, measured, count, samples)
+            most = runtime.gather(state.failures).max()
             seconds, done = (time.monotonic() - since) / count, done + count
             if warm:  # the first dispatch says nothing about speed
                 reporter.update(done * samples, samples / seconds, mean_return)
@@ -256,19 +251,6 @@ def _iterate(
             stopping = signals.anywhere()
             if stopping or last or done % every == 0:
                 logger.save(state)
-                logger.draw()
-
-
-def _count_failures(
-    failures: np.ndarray, measured: dict[str, Any], count: int, samples: int
-) -> tuple[np.ndarray, int]:
-    """Return failed iterations in a row [S] after `count` more, and the most on the way there."""
-    most = 0
-    for i in range(count):
-        failed = (measured["skipped"][i] > 0) | (measured["nonfinite"][i] > samples / 2)
-        failures = np.where(failed, failures + 1, 0)
-        most = max(most, int(failures.max()))
-    return failures, most
 
 
 def _budget(config: ResolvedConfig) -> str:

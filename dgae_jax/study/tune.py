@@ -168,12 +168,12 @@ def _train(tuning: Tuning, study: Study, trial: Trial) -> float:
             raise optuna.TrialPruned
 
     try:
-        value = float(training.train(config, options, report).evaluation["return_mean"])
+        evaluation, _ = training.train(config, options, report)
     except DivergedError as reason:
         raise optuna.TrialPruned from reason
     except RunError:
         _retry(study, study.trials[trial.number])
         raise
-    if not math.isfinite(value):
+    if not math.isfinite(evaluation["return_mean"]):
         raise optuna.TrialPruned
-    return value
+    return evaluation["return_mean"]

@@ -81,25 +81,14 @@ def test_directory_that_cannot_be_locked_is_refused(run_dir):
 
 
 @pytest.mark.parametrize("make", [lambda path: path.symlink_to("outside"), os.mkfifo])
-@pytest.mark.parametrize("name", ["config.json", "checkpoints/steps_000000000256.msgpack"])
+@pytest.mark.parametrize("name", ["curve.png", "checkpoints/steps_000000000256.msgpack"])
 def test_link_or_pipe_in_run_directory_is_refused(name, make, run_dir):
     (run_dir / name).rename((run_dir / name).with_name("outside"))
     make(run_dir / name)
     before = sorted((p, p.lstat().st_mtime_ns) for p in run_dir.rglob("*"))
-    with pytest.raises(ConfigError, match=rf"run/{name}: must be in the run directory itself"):
+    with pytest.raises(ConfigError, match=rf"run/{name}: must be .* not a link or pipe"):
         exit_code(small(), resume=run_dir)
     assert sorted((p, p.lstat().st_mtime_ns) for p in run_dir.rglob("*")) == before
-
-
-def test_link_in_place_of_written_file_is_not_followed(run_dir, tmp_path):
-    (tmp_path / "outside").write_text("mine")
-    links = [run_dir / name for name in ("curve.png", "curve.png.part", "manifest.json.part")]
-    for link in links:
-        link.unlink(missing_ok=True)
-        link.symlink_to(tmp_path / "outside")
-    assert exit_code(small(), resume=run_dir) == 0
-    assert (tmp_path / "outside").read_text() == "mine"
-    assert not any(link.is_symlink() for link in links)
 
 
 class Killed(BaseException):

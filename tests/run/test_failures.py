@@ -86,15 +86,6 @@ def test_nonfinite_updates_are_skipped_counted_and_end_run(tmp_path, capsys):
     assert not (run_dir / "evaluation.json").exists()
 
 
-def test_failures_within_a_dispatch_are_seen():
-    skipped = np.array([[1, 0], [1, 0], [0, 0], [1, 0], [9, 9]])
-    nonfinite = np.array([[0, 0], [0, 33], [32, 33], [0, 0], [9, 9]])
-    measured = {"skipped": skipped, "nonfinite": nonfinite}
-    failures, most = training._count_failures(np.array([2, 0]), measured, 4, 64)
-    # half of the 64 steps is not most of them
-    assert (failures.tolist(), most) == ([1, 0], 4)
-
-
 def test_nonfinite_network_ends_run_unsaved_in_one_line(tmp_path, capsys, monkeypatch):
     run_dir, broken = tmp_path / "run", {"policy.params": np.array([np.nan])}
     monkeypatch.setattr(checkpoint, "arrays_of", lambda state: broken)

@@ -1,16 +1,13 @@
 """Metrics, evaluations and the learning curve."""
 
 import dataclasses
-import time
 
 import numpy as np
 import pytest
 
 from dgae_jax.configs.config import ConfigError
-from dgae_jax.run import checkpoint, files, logger, metrics
-from dgae_jax.run.logger import RunLogger
+from dgae_jax.run import files, metrics
 from dgae_jax.run.metrics import EvaluationsFile, MetricsFile
-from dgae_jax.run.options import RunOptions
 from tests.runs import SMALL
 
 CONFIG = dataclasses.replace(SMALL, num_envs=10, num_steps=10)
@@ -86,24 +83,6 @@ def test_damaged_evaluation_does_not_count(row, tmp_path):
     assert len(file.rows) == 1
     file.cut(1000, 2)
     assert not file.has(100)  # it lacks a seed
-
-
-def test_checkpoint_is_on_disk_before_its_evaluation(state, tmp_path, monkeypatch):
-    seen, save = [], checkpoint.save
-
-    def slow(*args):
-        time.sleep(0.5)
-        seen.append((tmp_path / "evaluations.jsonl").read_bytes())
-        save(*args)
-
-    evaluation = {"seeds": [{"seed": 0, "return_mean": 1.0, "return_std": 0.0, "returns": [1.0]}]}
-    monkeypatch.setattr(checkpoint, "save", slow)
-    monkeypatch.setattr(logger, "evaluate_policies", lambda *_, **__: evaluation)
-    with RunLogger(tmp_path, SMALL, RunOptions(), 0) as run:
-        run.save(state)
-        run.evaluate(state, print)
-    assert seen == [b""]
-    assert [row["return_mean"] for row in run.evaluations.rows] == [1.0]
 
 
 @pytest.mark.parametrize(("seeds", "names"), [(1, 2), (3, 3)])
