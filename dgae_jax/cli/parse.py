@@ -178,8 +178,9 @@ def arguments(
     tyro._experimental_options["ansi_codes"] = not os.environ.get("NO_COLOR")
     options = {"description": inspect.getdoc(cls), **options}
     config = (tyro.conf.PositionalMetavarFromFieldName,)
+    stdout: Any = terminal.Steady(sys.stdout)
     try:
-        with contextlib.redirect_stdout(terminal.Steady(sys.stdout)):
+        with contextlib.redirect_stdout(stdout):
             return tyro.cli(
                 cls, args=argv, default=default, config=config, registry=registry, **options
             )
@@ -204,7 +205,6 @@ class Command(NamedTuple):
 
     def __call__(self) -> int:
         """Run on the command line of this process, and return the exit code."""
-        terminal.prepare()
         try:
             return self.work(self.read(sys.argv[1:])) or 0
         except ConfigError as mistake:

@@ -99,7 +99,7 @@ class WeightsAndBiases:
         )
         self.run.config.update(settings, allow_val_change=True)
         self.run.define_metric("*", step_metric="steps")
-        if self.run.url:
+        if not self.run.offline:
             terminal.say(f"{name} at {self.run.url}")
 
     def log(self, rows: Rows) -> None:

@@ -5,13 +5,12 @@ A failed write costs a line, never the run. This module imports nothing of the p
 
 import contextlib
 import datetime
-import io
 import os
 import sys
 import time
 from collections.abc import Callable, Iterator
 from contextvars import ContextVar
-from typing import Any, TextIO
+from typing import Any
 
 LINE_SECONDS = 10.0
 """Time between progress lines where there is no terminal."""
@@ -23,18 +22,6 @@ PICTURE_WIDTH = 640
 """Width of a picture in a notebook [CSS pixels]."""
 
 _silent: ContextVar[bool] = ContextVar("silent", default=False)
-
-
-def prepare() -> None:
-    """Make the standard streams harmless; the first thing that a command does.
-
-    Closed streams (`>&-`) are opened on /dev/null, so that no file of the run takes their place.
-    """
-    for name, mode in (("stdin", "r"), ("stdout", "w"), ("stderr", "w")):
-        if getattr(sys, name) is None:  # the lowest free number is that of this stream
-            nothing = os.open(os.devnull, os.O_RDWR)
-            os.set_inheritable(nothing, True)
-            setattr(sys, name, open(nothing, mode))  # noqa: PTH123, SIM115
 
 
 def say(text: str) -> None:
@@ -60,11 +47,9 @@ def silenced(quiet: bool = True) -> Iterator[None]:
 
 def is_live() -> bool:
     """Return whether stdout is a terminal on which a line can be rewritten."""
-    try:
-        dumb = os.environ.get("TERM") in (None, "", "dumb", "unknown")
-        return sys.stdout is not None and sys.stdout.isatty() and not dumb and not _silent.get()
-    except ValueError:  # closed
+    if sys.stdout is None or sys.stdout.closed or _silent.get():
         return False
+    return sys.stdout.isatty() and os.environ.get("TERM", "") not in ("", "dumb", "unknown")
 
 
 def in_notebook() -> bool:
@@ -74,17 +59,12 @@ def in_notebook() -> bool:
     return getattr(shell, "kernel", None) is not None and not _silent.get()
 
 
-def write(stream: TextIO | None, text: str) -> None:
+def write(stream: Any, text: str) -> None:
     """Write and flush, or give the stream up for good."""
-    if stream is None:
-        return
     try:
-        try:
-            stream.write(text)
-        except UnicodeEncodeError:
-            escaped = text.encode(stream.encoding, "backslashreplace")
-            stream.write(escaped.decode(stream.encoding))
-        stream.flush()
+        print(text, end="", file=stream, flush=True)
+    except UnicodeEncodeError:
+        write(stream, text.encode("ascii", "backslashreplace").decode())
     except (OSError, ValueError):  # no reader, a full disk, a closed stream
         with contextlib.suppress(OSError, ValueError, AttributeError):
             # Python flushes the rest once more at exit
@@ -93,23 +73,19 @@ def write(stream: TextIO | None, text: str) -> None:
             os.close(nothing)
 
 
-class Steady(io.StringIO):
-    """A stdout for libraries that print: no write to it fails."""
+class Steady:
+    """A stream for libraries that print: no write to it fails."""
 
-    def __init__(self, stream: TextIO):
-        super().__init__()
+    def __init__(self, stream: Any):
         self.stream = stream
-        self.isatty, self.fileno = stream.isatty, stream.fileno
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self.stream, name)
 
     def write(self, text: str) -> int:
         """Write to the stream beneath, or lose the text."""
         write(self.stream, text)
         return len(text)
-
-    @property
-    def encoding(self) -> str:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """Encoding of the stream beneath."""
-        return self.stream.encoding
 
 
 class Page:
@@ -147,8 +123,8 @@ class Reporter:
             from rich.progress import BarColumn, Progress, TextColumn
 
             columns = BarColumn(None), TextColumn("{task.description}")
-            console = Console(file=Steady(sys.stdout))
-            self.bar = Progress(*columns, console=console, transient=not total)
+            stdout: Any = Steady(sys.stdout)
+            self.bar = Progress(*columns, console=Console(file=stdout), transient=not total)
             self.task = self.bar.add_task("", total=total or None)
 
     def __enter__(self) -> "Reporter":

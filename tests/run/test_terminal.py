@@ -39,21 +39,6 @@ def test_failed_write_costs_the_line(stream, monkeypatch):
         reporter.update(100, 1.0, None)
 
 
-def test_missing_characters_are_escaped(monkeypatch):
-    stream = io.TextIOWrapper(io.BytesIO(), encoding="latin-1")
-    monkeypatch.setattr(sys, "stdout", stream)
-    terminal.say("1.0 ± 0.5 – γ")
-    assert stream.buffer.getvalue() == b"1.0 \xb1 0.5 \\u2013 \\u03b3\n"
-
-
-def test_silenced_run_still_warns(capsys):
-    with terminal.silenced():
-        terminal.say("a")
-        terminal.warn("b")
-    terminal.say("c")
-    assert capsys.readouterr() == ("c\n", "b\n")
-
-
 def train(run_dir, shell="", **how):
     """Start the command on a tiny run, with its streams as the shell says."""
     flags = ["--run-dir", run_dir, "--total-steps", "128", "--algo", "ppo", "--episodes", "1"]
@@ -67,30 +52,17 @@ def assert_whole(process, run_dir):
     assert (run_dir / "evaluation.json").exists()
 
 
-OLD = {**os.environ, "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0", "LC_ALL": "C"}
-ASCII = {**OLD, "PYTHONIOENCODING": "ascii"}
-
-
 @pytest.mark.parametrize(
-    ("shell", "environment"),
-    [
-        pytest.param(">/dev/full 2>/dev/full", OLD, marks=pytest.mark.slow),
-        (">&- 2>&- <&-", OLD),
-        pytest.param(">/dev/null", ASCII, marks=pytest.mark.slow),
-        pytest.param("| head -n 1", OLD, marks=pytest.mark.slow),
-    ],
+    "shell", [">/dev/full 2>/dev/full", pytest.param("| head -n 1", marks=pytest.mark.slow)]
 )
-def test_run_survives_its_streams(shell, environment, tmp_path):
-    assert_whole(train(tmp_path / "run", shell, env=environment), tmp_path / "run")
-    for name in ("metrics.jsonl", "evaluations.jsonl"):  # nothing that was printed went into a file
-        lines = (tmp_path / "run" / name).read_bytes().splitlines()
-        assert all(line.startswith(b'{"') for line in lines)
+def test_run_survives_its_streams(shell, tmp_path):
+    assert_whole(train(tmp_path / "run", shell), tmp_path / "run")
 
 
 @pytest.mark.parametrize("hung_up", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_live_bar_survives_an_old_or_closed_terminal(hung_up, tmp_path):
     master, slave = pty.openpty()
-    environment = {**ASCII, "TERM": "xterm"}
+    environment = {**os.environ, "PYTHONIOENCODING": "ascii", "TERM": "xterm"}
     process = train(tmp_path / "run", stdout=slave, stderr=slave, env=environment)
     os.close(slave)
     shown = os.read(master, 1000)
