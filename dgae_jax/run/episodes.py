@@ -3,7 +3,6 @@
 The one place that steps episodes outside training; evaluation, calibration and video share it.
 """
 
-import warnings
 from collections.abc import Callable, Iterator, Sequence
 from functools import lru_cache
 from typing import Any, NamedTuple
@@ -15,7 +14,6 @@ from jaxtyping import Bool, Float
 
 from dgae_jax.configs.resolved import ResolvedConfig
 from dgae_jax.envs.registry import CUSTOM_ENVS, spec_of
-from dgae_jax.learn import play
 from dgae_jax.learn.build import make_greedy, make_policy, make_task, make_trainer
 from dgae_jax.learn.iteration import sampler
 from dgae_jax.learn.parallel import Trainer
@@ -51,16 +49,15 @@ def episode_seeds(seed: int, episodes: int) -> np.ndarray:
 
 def make_eval_env(config: ResolvedConfig, max_steps: int | None = None) -> Any:
     """Return the task in Gymnasium with a time limit, by default that of training."""
-    import gymnasium  # here, so that training alone does not import it
+    # here, so that training alone does not import Gymnasium
+    from gymnasium.wrappers import TimeLimit
 
-    limit = config.episode_length if max_steps is None else max_steps
-    if spec_of(config.env).gymnasium_id is None:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # that v4 is not the latest version is known
-            return gymnasium.make(eval_env_id(config), max_episode_steps=limit)
     from dgae_jax.envs.gymnasium import make_gym_env
 
-    return gymnasium.wrappers.TimeLimit(make_gym_env(eval_env_id(config)), limit)
+    limit = config.episode_length if max_steps is None else max_steps
+    if spec_of(config.env).on_host:  # its own limit may be shorter
+        return TimeLimit(make_gym_env(eval_env_id(config)), limit)
+    return make_gym_env(eval_env_id(config), max_episode_steps=limit)
 
 
 def time_limit(config: ResolvedConfig) -> int:
@@ -106,22 +103,23 @@ def gymnasium_steps(
         yield EvalStep(before, reward, alive.copy(), over, snapshots)
 
 
-class _Programs(NamedTuple):
-    act: Callable[[InferenceState, Any], jax.Array]
-    advance: Callable[[InferenceState, play.Play, int], play.Play]
-    trainer: Trainer
-
-
 @lru_cache(maxsize=1)
-def _programs(config: ResolvedConfig, custom: Any) -> _Programs:
-    """Return the programs of a run; `custom` is the object of a custom task."""
+def _programs(config: ResolvedConfig, custom: Any) -> tuple[Any, Any, Trainer]:
+    """Return the jitted policy, steps of all envs, and trainer; `custom` is an env object."""
     env = make_task(config)
     greedy = make_greedy(env, config)
 
-    def advance(policy: InferenceState, now: play.Play, until: int) -> play.Play:
-        return play.play(env, lambda obs: greedy(policy, obs), now, until)
+    def advance(policy: InferenceState, episodes: tuple, count: int) -> tuple:
+        """Take `count` steps from env states, returns so far and whether each still runs [E]."""
 
-    return _Programs(jax.jit(greedy), jax.jit(advance), make_trainer(env, 1))
+        def one(_, episodes: tuple) -> tuple:
+            state, total, alive = episodes
+            state = jax.vmap(env.step)(state, greedy(policy, state.obs))
+            return state, total + jnp.where(alive, state.reward, 0), alive & (state.done == 0)
+
+        return jax.lax.fori_loop(0, count, one, episodes)
+
+    return jax.jit(greedy), jax.jit(advance), make_trainer(env, 1)
 
 
 def _progress(step: int, config: ResolvedConfig, alive: int) -> str:
@@ -133,7 +131,7 @@ def gymnasium_returns(
 ) -> np.ndarray:
     """Return undiscounted returns [E] of the mean action in Gymnasium, side by side."""
     envs = [make_eval_env(config) for _ in range(episodes)]
-    act = _programs(config, CUSTOM_ENVS.get(config.env)).act
+    act, *_ = _programs(config, CUSTOM_ENVS.get(config.env))
     shape = (episodes, *envs[0].observation_space.shape)
     compile_in_thread(act, policy, np.zeros(shape, np.float32), watch=watch)
     total, seeds = np.zeros(episodes), episode_seeds(seed, episodes)
@@ -151,13 +149,16 @@ def jax_returns(
     policy: InferenceState, config: ResolvedConfig, episodes: int, seed: int, watch: Watch
 ) -> np.ndarray:
     """Return undiscounted returns [E] of the mean action in the physics of `config`."""
-    programs = _programs(config, CUSTOM_ENVS.get(config.env))
-    now = play.begin(_fresh_envs(config, programs.trainer, seed, episodes, watch))
-    compile_in_thread(programs.advance, policy, now, 1, watch=watch, what="compiling steps")
-    while (step := int(now.step)) < config.episode_length and (alive := int(now.alive.sum())):
+    _, advance, trainer = _programs(config, CUSTOM_ENVS.get(config.env))
+    state = _fresh_envs(config, trainer, seed, episodes, watch)
+    now = state, jnp.zeros_like(state.reward), jnp.full(episodes, True)
+    compile_in_thread(advance, policy, now, 1, watch=watch, what="compiling steps")
+    for step in range(0, config.episode_length, CHUNK):
+        if not (alive := int(now[2].sum())):
+            break
         watch(_progress(step, config, alive))
-        now = programs.advance(policy, now, min(step + CHUNK, config.episode_length))
-    return np.asarray(now.total, np.float64)
+        now = advance(policy, now, min(CHUNK, config.episode_length - step))
+    return np.asarray(now[1], np.float64)
 
 
 def _fresh_envs(

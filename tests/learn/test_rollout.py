@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
-from dgae_jax.learn.play import begin, play
 from dgae_jax.learn.rollout import rollout, start
 from tests.probes import Counter, Fragile
 
@@ -121,18 +120,3 @@ def test_an_env_depends_on_its_own_keys_alone(key):
     whole, half = (x._replace(incident=()) for x in (whole, half))
     jax.tree.map(lambda a, b: assert_array_equal(a[3:], b), whole, half)
     jax.tree.map(lambda a, b: assert_array_equal(a[:, 3:], b), all_steps, steps)
-
-
-# ---- episodes that are only watched ----
-
-
-@pytest.mark.parametrize("limits", [[4], [1, 2, 3, 4]])
-@pytest.mark.parametrize("length", [3, 9])
-def test_play_sums_each_episode_until_its_end_in_chunks_of_any_size(length, limits, key):
-    env = Counter(length=length)  # pays 1, 2, 3, …
-    episodes = begin(jax.vmap(env.reset)(jax.random.split(key, 6)))
-    for until in limits:
-        episodes = play(env, lambda obs: jnp.zeros((*obs.shape[:-1], 1)), episodes, until)
-    assert_allclose(episodes.total, [sum(range(1, min(length, 4) + 1))] * 6)
-    assert episodes.alive.all() == (length > 4)
-    assert int(episodes.step) == min(length, 4)
