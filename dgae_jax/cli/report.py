@@ -33,7 +33,7 @@ class Arguments:
 
 @parse.command(Arguments)
 def report(args: Arguments) -> None:
-    """Write a report, after everything that can be wrong was checked."""
+    """Write the tables of a document, videos, figures and the page."""
     if not args.sweeps:
         raise ConfigError("SWEEPS: must be the directory of one sweep or more")
     if args.markdown and len(args.sweeps) > 1:
@@ -45,15 +45,14 @@ def report(args: Arguments) -> None:
     from dgae_jax.report import groups, markdown, page
 
     if args.markdown:
-        markdown.find(args.markdown, sweeps[0].name)
-    for sweep in sweeps if args.videos else ():
-        _write_videos(sweep)
-    for path in page.write(sweeps, out, published):
-        terminal.say(f"written {path}")
-    if args.markdown:
         tables = groups.groups_of(sweeps[0].rows)
         names = markdown.replace(args.markdown, tables, sweeps[0].name)
         terminal.say(f"written {args.markdown}: {', '.join(names)}")
+    for sweep in sweeps if args.videos else ():
+        _write_videos(sweep)
+    with parse.writing(out, "directory"):
+        for path in page.write(sweeps, out, published):
+            terminal.say(f"written {path}")
 
 
 def typical(rows: list[Row]) -> Row:

@@ -65,7 +65,7 @@ def learning_curves(groups: Iterable[Group], published: Sequence[Published] = ()
         axes.set(xlabel="environment steps", ylabel="episode return")
         axes.xaxis.set_major_formatter(EngFormatter(sep=""))
 
-    return _panels(by_task(groups), draw, PANEL[1], legend=True)
+    return _panels(by_task(groups), draw, PANEL[1])
 
 
 def _line(
@@ -97,20 +97,8 @@ def final_returns(groups: Iterable[Group]) -> Figure:
         _dots(axes, members, [analysis.interquartile_mean(scores) for scores in finals], finals)
         axes.set_xlabel("return of the final policy")
 
-    return _dot_panels(by_task(groups), draw)
-
-
-def speed(groups: Iterable[Group]) -> Figure:
-    """Draw the mean samples per second, and each seed."""
-
-    def draw(axes: Axes, members: Sequence[Group]) -> None:
-        rates = [np.array([row.samples_per_second for row in group.rows]) for group in members]
-        _dots(axes, members, [Estimate(rate.mean(), None) for rate in rates], rates)
-        axes.set_xlabel("samples per second")
-        axes.set_xlim(0, 1.1 * max(rate.max() for rate in rates))
-        axes.xaxis.set_major_formatter(EngFormatter(sep=""))
-
-    return _dot_panels(by_task(groups), draw)
+    tasks = by_task(groups)
+    return _panels(tasks, draw, 0.9 + 0.28 * max(map(len, tasks.values())))
 
 
 def improvement(found: Sequence[Improvement]) -> Figure:
@@ -125,7 +113,7 @@ def improvement(found: Sequence[Improvement]) -> Figure:
         axes.set(xlabel="probability of improvement", xlim=(-0.03, 1.03))
         axes.xaxis.set_major_formatter(PercentFormatter(1))
 
-    return _dot_panels({"Distributional against scalar": found}, draw, each=0.4)
+    return _panels({"Distributional against scalar": found}, draw, 0.9 + 0.4 * len(found))
 
 
 def performance_profile(groups: Iterable[Group]) -> Figure:
@@ -142,7 +130,7 @@ def performance_profile(groups: Iterable[Group]) -> Figure:
         axes.yaxis.set_major_formatter(PercentFormatter(1))
 
     scores = analysis.normalised(groups)
-    return _panels({"Performance profile": scores}, draw, PANEL[1], legend=True)
+    return _panels({"Performance profile": scores}, draw, PANEL[1])
 
 
 def coverage(statistics: Mapping[str, Any]) -> str:
@@ -172,7 +160,7 @@ def pit_histograms(found: Mapping[str, tuple[str, dict[str, Any]]]) -> Figure:
         axes.yaxis.set_major_formatter(PercentFormatter(1, decimals=0))
 
     titled = {f"{name}\n{coverage(critic[1])}": critic for name, critic in found.items()}
-    return _panels(titled, draw, PANEL[1], columns=3, sharey=True, legend=True)
+    return _panels(titled, draw, PANEL[1], columns=3, sharey=True)
 
 
 def _dots(
@@ -192,12 +180,6 @@ def _dots(
     axes.grid(axis="y", visible=False)
 
 
-def _dot_panels(
-    contents: Mapping[str, Sequence[Any]], draw: Callable[[Axes, Any], None], each: float = 0.28
-) -> Figure:
-    return _panels(contents, draw, 0.9 + each * max(map(len, contents.values())))
-
-
 def _panels(
     contents: Mapping[str, Any],
     draw: Callable[[Axes, Any], None],
@@ -205,33 +187,27 @@ def _panels(
     *,
     columns: int = 2,
     sharey: bool = False,
-    legend: bool = False,
 ) -> Figure:
     """Draw a panel per content, with its title, and one legend for all."""
     columns = min(columns, len(contents))
     rows = -(-len(contents) // columns)
     with mpl.rc_context(fname=STYLE):
-        size = columns * PANEL[0], rows * height + 0.5 * legend
-        figure = Figure(figsize=size, layout="constrained", dpi=150)
+        figure = Figure(layout="constrained", dpi=150)
         panels = list(figure.subplots(rows, columns, squeeze=False, sharey=sharey).flat)
         for axes, (title, content) in zip(panels, contents.items(), strict=False):
             draw(axes, content)
             axes.set_title(title)
         for axes in panels[len(contents) :]:
             axes.remove()
-        if legend:
-            _legend(figure)
+        handles: dict[str, Any] = {}
+        for axes in figure.axes:
+            found, labels = axes.get_legend_handles_labels()
+            handles |= dict(zip(labels, found, strict=True))
+        if handles:  # the two algorithms of a pair share a column
+            place: Any = {"loc": "outside lower center", "ncols": min(3, len(handles))}
+            figure.legend(handles.values(), handles, fontsize=8, handlelength=2.4, **place)
+        figure.set_size_inches(columns * PANEL[0], rows * height + 0.5 * bool(handles))
     return figure
-
-
-def _legend(figure: Figure) -> None:
-    """Draw each label once below the panels; the two of a pair share a column."""
-    handles: dict[str, Any] = {}
-    for axes in figure.axes:
-        found, labels = axes.get_legend_handles_labels()
-        handles |= dict(zip(labels, found, strict=True))
-    place: Any = {"loc": "outside lower center", "ncols": min(3, len(handles) or 1)}
-    figure.legend(handles.values(), handles, fontsize=8, handlelength=2.4, **place)
 
 
 def image(figure: Figure, kind: str) -> bytes:

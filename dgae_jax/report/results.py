@@ -91,22 +91,17 @@ def read(path: Path) -> Sweep:
             written and is not read.
 
     Raises:
-        ConfigError: no sweep, no results yet, or a row that cannot be understood.
+        ConfigError: no results yet, or a row that cannot be understood.
     """
-    plan, file = path / "study.json", path / RESULTS if path.is_dir() else path
+    file = path / RESULTS if path.is_dir() else path
     try:
-        if not file.exists() and not plan.exists():
-            why = f"must be the directory of a sweep, with study.json and {RESULTS}"
-            raise ConfigError(f"{path}: {why}")
         found = _rows(file) if file.exists() else {}
-        planned = files.read_object(plan).get("cells") if plan.exists() else {}
     except OSError as reason:
         raise ConfigError(f"{path}: cannot be read ({reason.strerror})") from reason
-    if planned is None:
-        raise ConfigError(f"{plan}: must be an object with the runs of the sweep")
     rows = tuple(row for row in found.values() if row)
     if not rows:
-        raise ConfigError(f"{path}: must have results; {RESULTS} has none yet")
+        raise ConfigError(f"{path}: must be the directory of a sweep with results in {RESULTS}")
+    planned = files.read_object(path / "study.json").get("cells", {})
     done = {run for run, _ in found}
     diverged = tuple(key for key, row in found.items() if row is None)
     return Sweep(path, rows, tuple(run for run in planned if run not in done), diverged)

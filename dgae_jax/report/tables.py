@@ -45,26 +45,6 @@ def returns(groups: Iterable[Group]) -> Table:
     return Table(names, rows)
 
 
-def attribution(groups: Iterable[Group]) -> Table:
-    """Variants against the first of their task, by final return and by the mean during training.
-
-    The mean during training depends less on where the run ends.
-    """
-    rows = []
-    for members in by_task(groups).values():
-        first = members[0]
-        for group in members:
-            pairs = (first.finals, group.finals), (first.averages, group.averages)
-            texts = [
-                (spread(ours), NONE if group is first else _difference(theirs, ours))
-                for theirs, ours in pairs
-            ]
-            rows.append((*_key(group), *texts[0], *texts[1]))
-    different = "difference from the first [95 %]"
-    end, run = "at the end, mean ± std", "over the run, mean ± std"
-    return Table(("task", "variant", "seeds", end, different, run, different), rows)
-
-
 def attribution_over_tasks(groups: Iterable[Group]) -> Table:
     """Probability that a seed of a variant scores above one of the first variant of its task."""
     duels: dict[str, list[tuple[Group, Group]]] = {}
@@ -141,10 +121,13 @@ def comparison(first: Iterable[Group], second: Iterable[Group], names: tuple[str
     )
     rows, either = [], {**ours, **theirs}
     for key in sorted(either, key=lambda key: order(either[key].rows[0])):
-        finals = [groups[key].finals if key in groups else None for groups in (ours, theirs)]
-        means = [NONE if x is None else between(analysis.interquartile_mean(x)) for x in finals]
-        one, two = finals
-        rows.append((*key, *means, NONE if one is None or two is None else _difference(one, two)))
+        finals = [groups[key].finals for groups in (ours, theirs) if key in groups]
+        means = [
+            between(analysis.interquartile_mean(groups[key].finals)) if key in groups else NONE
+            for groups in (ours, theirs)
+        ]
+        change = between(analysis.difference(*finals), "{:+,.0f}") if len(finals) == 2 else NONE
+        rows.append((*key, *means, change))
     columns = [f"{name}, {IQM}" for name in names]
     return Table(("task", "algorithm", *columns, "difference [95 %]"), rows)
 
@@ -155,10 +138,6 @@ def _key(group: Group) -> tuple[str, str, str]:
 
 def _scores(scores: np.ndarray) -> tuple[str, str]:
     return spread(scores), between(analysis.interquartile_mean(scores))
-
-
-def _difference(first: np.ndarray, second: np.ndarray) -> str:
-    return between(analysis.difference(first, second), "{:+,.0f}")
 
 
 def number(value: float, form: str = "{:,.0f}") -> str:

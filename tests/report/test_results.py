@@ -48,14 +48,9 @@ def test_file_of_results_is_a_sweep_without_a_plan(tmp_path):
 
 
 def test_directory_that_is_no_sweep_is_refused(tmp_path):
-    assert refusal(tmp_path / "none").startswith(f"{tmp_path}/none: must be")
-    assert "with study.json and results.jsonl" in refusal(tmp_path)
-    assert "must have results" in refusal(study(tmp_path, []))
-    (tmp_path / "results.jsonl").unlink()
-    assert "must have results" in refusal(tmp_path)
-    study(tmp_path, [row()])
-    (tmp_path / "study.json").write_text("[]")
-    assert refusal(tmp_path).startswith(f"{tmp_path}/study.json: must be an object")
+    study(tmp_path / "planned", []).joinpath("results.jsonl").unlink()
+    for path in (tmp_path / "none", tmp_path, tmp_path / "planned", study(tmp_path / "empty", [])):
+        assert refusal(path).startswith(f"{path}: must be the directory of a sweep with results")
 
 
 def test_rows_are_refused_by_their_number(tmp_path):

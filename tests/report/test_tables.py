@@ -39,22 +39,6 @@ def trained(scores, average, variant, env="hopper", **changes):
     return plain(scores, env, **{"variant": variant, "run": run, "curve": curve} | changes)
 
 
-def test_variants_are_compared_with_the_first_of_their_task(grouped):
-    noise = row("hopper", "dppo")["config"] | {"noise": {"reward": 0.5}}  # another task
-    rows = [
-        *trained([1, 3], 2, "scalar", algo="ppo"),
-        *trained([10, 10], 4, "bellman"),
-        *trained([5, 5], 1, "kappa"),
-        *trained([7], 6, "kappa+noise", config=noise),
-    ]
-    assert tables.attribution(grouped(rows)).rows == [
-        ("hopper-v4", "PPO (scalar)", "2", "2 ± 1", "–", "2 ± 0", "–"),
-        ("hopper-v4", "DPPO (bellman)", "2", "10 ± 0", "+8 [+7, +9]", "4 ± 0", "+2 [+2, +2]"),
-        ("hopper-v4", "DPPO (kappa)", "2", "5 ± 0", "+3 [+2, +4]", "1 ± 0", "−1 [−1, −1]"),
-        ("hopper-v4 with noise", "DPPO (kappa)", "1", "7 ± –", "–", "6 ± –", "–"),
-    ]
-
-
 def test_over_tasks_the_wins_of_a_variant_are_averaged(grouped):
     rows = [
         *trained([2, 4], 1, "scalar", algo="ppo"),
@@ -95,27 +79,25 @@ def test_tables_of_a_document_are_replaced_and_the_rest_stays(grouped, tmp_path)
     path.write_text(block("returns of short") + block("speed of long"))
     assert markdown.replace(path, groups, "long") == ["speed"]
     assert path.read_text() == block("returns of short") + block("speed of long", speed)
-    with pytest.raises(ConfigError, match="a table of other; its tables are of short, long"):
-        markdown.find(path, "other")
 
 
-MARKERS = "with tables between lines <!-- dgae report: NAME --> and <!-- /dgae report -->"
+TABLES = "with tables of sweep between lines <!-- dgae report: NAME --> and <!-- /dgae report -->"
 
 
 @pytest.mark.parametrize(
     ("text", "sentence"),
     [
-        ("nothing", MARKERS),
-        ("\xff", "not text in UTF-8"),
-        ("<!-- dgae report: returns -->\n" + block("speed"), MARKERS),
-        (block("x"), "NAME is one of iqm, returns"),
-        (block("returns") + block("speed of long"), "with NAME of SWEEP for all tables"),
+        ("nothing", TABLES),
+        ("\xff", "that can be read"),
+        ("<!-- dgae report: returns -->\n" + block("speed"), TABLES),
+        (block("returns") + block("x"), "NAME is one of iqm, returns"),
+        (block("returns of other"), TABLES),
     ],
 )
-def test_markers_that_do_not_match_are_refused(text, sentence, tmp_path):
+def test_document_without_a_table_to_replace_is_refused(text, sentence, grouped, tmp_path):
     path = tmp_path / "doc.md"
     path.write_bytes(text.encode("latin-1"))
     with pytest.raises(ConfigError) as caught:
-        markdown.find(path, "sweep")
+        markdown.replace(path, grouped([row()]), "sweep")
     assert str(caught.value).startswith(f"markdown {path}: must be a file ")
     assert sentence in str(caught.value)
