@@ -44,8 +44,8 @@ def row(sweep: Path, run: Row) -> dict:
     with TemporaryDirectory() as place:
         made = refit(source, directory.config_of(source), which="latest")
         file = Path(place) / source.name
-        checkpoint.save_networks(file, made.config, made.networks, made.std)
-        found = calibrate(file, made.config, which="latest")
+        checkpoint.save_networks(file, *made)
+        found = calibrate(file, made[0], which="latest")
     critic = f"refit to {run.algo.upper()}"
     return {"task": run.env, "critic": critic, "seed": run.seed, "return": run.final, **found}
 

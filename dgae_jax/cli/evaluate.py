@@ -152,6 +152,6 @@ def refit(args: RefitArguments) -> None:
         from dgae_jax.run import calibration, checkpoint
 
         how = {"which": args.checkpoint, "index": args.index, "seed": args.seed}
-        found = calibration.refit(args.run_dir, config, num_envs=args.num_envs, watch=watch, **how)
-        checkpoint.save_networks(out, found.config, found.networks, found.std)
-    terminal.say(f"fitted to {found.returns:,} returns; written to {out}")
+        made = calibration.refit(args.run_dir, config, num_envs=args.num_envs, watch=watch, **how)
+        checkpoint.save_networks(out, *made)
+    terminal.say(f"written {out}")

@@ -64,7 +64,7 @@ def sgd(
         return TrainableState(optax.apply_updates(state.params, updates), opt_state), info
 
     def step(key: jax.Array, state: TrainableState, batch: Any):
-        size = batch.obs.shape[0]
+        size = len(jax.tree.leaves(batch)[0])
         if size % minibatches:
             raise ValueError(f"{size} samples do not divide into {minibatches} minibatches")
 

@@ -14,7 +14,7 @@ from dgae_jax.configs.resolved import ResolvedConfig, resolve
 from dgae_jax.envs.base import has_limit
 from dgae_jax.learn.build import make_quantiles, make_task
 from dgae_jax.learn.diagnostics import SIMILAR, similar_means
-from dgae_jax.learn.networks import Network, value_network
+from dgae_jax.learn.networks import value_network
 from dgae_jax.learn.normalizers import normalize
 from dgae_jax.learn.types import InferenceState, Params, TrainableState
 from dgae_jax.learn.updates import minibatch_update
@@ -56,18 +56,19 @@ class MonteCarlo(NamedTuple):
     """Discounted sum of the unscaled rewards from each step on."""
 
 
-def steps_that_count(gamma: float) -> int:
-    """Return how many rewards of a return weigh more than `NEGLIGIBLE`."""
-    return int(np.count_nonzero(gamma ** np.arange(MAX_RETURN_STEPS) > NEGLIGIBLE))
+def return_steps(config: ResolvedConfig) -> int:
+    """Return how many rewards of a return weigh more than `NEGLIGIBLE`.
 
-
-def check_returns(config: ResolvedConfig) -> None:
-    """Raise ConfigError where returns have no end: γ near 1, or a time limit of the task."""
-    if steps_that_count(config.gamma) == MAX_RETURN_STEPS:
+    Raises:
+        ConfigError: returns have no end, by γ near 1 or a time limit of the task.
+    """
+    steps = int(np.count_nonzero(config.gamma ** np.arange(MAX_RETURN_STEPS) > NEGLIGIBLE))
+    if steps == MAX_RETURN_STEPS:
         limit = f"at most {NEGLIGIBLE ** (1 / MAX_RETURN_STEPS):.4f}, so that returns end"
         raise invalid("gamma", config.gamma, limit)
     if has_limit(make_task(config)):
         raise invalid("env", config.env, "a task without a time limit of its own")
+    return steps
 
 
 def monte_carlo(
@@ -77,8 +78,7 @@ def monte_carlo(
 
     Each return is followed until further rewards do not count.
     """
-    check_returns(config)
-    length = config.episode_length + steps_that_count(config.gamma)
+    length = config.episode_length + return_steps(config)
     kept = -(-config.episode_length // SAMPLED_CHUNK)
     seen, paid = [], []
     for step in sampled_steps(policy, config, key, num_envs, length, watch):
@@ -114,7 +114,7 @@ def calibrate(
         [T − 1, N] with |d(r + γG′, G)| ≤ share · W₁(r + γG′, G), by share.
 
     Raises:
-        ConfigError: as `check_returns`.
+        ConfigError: as `return_steps`.
         CheckpointError: as `checkpoint.load_networks` and `checkpoint.reward_std`.
     """
     found = checkpoint.load_networks(source, config, which)
@@ -164,24 +164,6 @@ def similar_mean_shares(
     return {str(share): round(float(mean), 6) for share, mean in similar.items()}
 
 
-class Samples(NamedTuple):
-    """Normalized observations and scaled returns that a distribution is fitted to."""
-
-    obs: Float[Array, "B O"]
-    returns: Float[Array, " B"]
-
-
-class Refitted(NamedTuple):
-    """A policy with a critic that was fitted to it, as `checkpoint.save_networks` takes them."""
-
-    config: ResolvedConfig
-    networks: Networks
-    std: Float[Array, "1"]
-    """Scale of the rewards."""
-    returns: int
-    """Number of returns it was fitted to."""
-
-
 def refit(
     source: Path,
     config: ResolvedConfig,
@@ -191,11 +173,14 @@ def refit(
     seed: int = 0,
     num_envs: int = 128,
     watch: Watch = unwatched,
-) -> Refitted:
+) -> tuple[ResolvedConfig, Networks, Float[Array, "1"]]:
     """Fit a `sorted` critic to Monte Carlo returns of a policy that is held fixed.
 
     Quantile regression (Koenker & Bassett 1978) without bootstrapping. Returns are scaled by
     their standard deviation. Arguments and errors as `calibrate`.
+
+    Returns:
+        The arguments of `checkpoint.save_networks`.
     """
     found = checkpoint.load_networks(source, config, which)
     policy = jax.tree.map(lambda x: x[index], found.policy)
@@ -204,41 +189,40 @@ def refit(
     spread = came.returns.std()
     std = jnp.where(spread > 0, spread, 1.0)
     obs = normalize(policy.obs_stats, came.obs).reshape(came.returns.size, -1)
-    samples = Samples(obs, (came.returns / std).ravel())
+    samples = obs, (came.returns / std).ravel()
     written = config.as_config()
     kept = {name: getattr(written.critic, name) for name in ("quantiles", "target")}
     critic = CriticConfig(kind="sorted", hidden=config.critic.hidden, **kept)
     one = {"seed": config.seed + index, "num_seeds": 1}
     config = resolve(written.replace(**one, normalize_rewards=True, critic=critic))
-    network = initial_network(samples, config.critic.outputs, config.critic.hidden)
-    params = fit_quantiles(network, samples, len(came.returns), fit_key, watch)
+    network = config.critic.outputs, config.critic.hidden
+    params = fit_quantiles(samples, *network, len(came.returns), fit_key, watch)
     states = policy, InferenceState(params, policy.obs_stats)
     policy, critic = jax.tree.map(lambda x: x[None], states)
-    return Refitted(config, Networks(policy, critic, found.path), std[None], came.returns.size)
-
-
-def initial_network(samples: Samples, quantiles: int, hidden: Sequence[int]) -> Network:
-    """Return a network that starts near the quantiles of all returns, which may be far from 0."""
-    bias = jnp.quantile(samples.returns, quantile_midpoints(quantiles))
-    return value_network(samples.obs.shape[-1], quantiles, hidden=hidden, bias=bias)
+    return config, Networks(policy, critic, found.path), std[None]
 
 
 def fit_quantiles(
-    network: Network,
-    samples: Samples,
+    samples: tuple[Float[Array, "B O"], Float[Array, " B"]],
+    outputs: int,
+    hidden: Sequence[int],
     minibatches: int,
     key: Key[Array, ""],
     watch: Watch = unwatched,
 ) -> Params:
-    """Fit the network's outputs to quantiles of the samples, in `PASSES` over them.
+    """Fit the outputs of a value network to quantiles of the returns, in `PASSES` over them.
 
-    The outputs are not sorted during the fit: as good, in half the time. `minibatches` is the
-    number of gradient steps per pass.
+    The outputs are not sorted during the fit: as good, in half the time. `samples` are normalized
+    observations and scaled returns, `minibatches` the number of gradient steps per pass.
     """
+    obs, returns = samples
+    bias = jnp.quantile(returns, quantile_midpoints(outputs))  # returns may be far from 0
+    network = value_network(obs.shape[-1], outputs, hidden=hidden, bias=bias)
 
     def loss(params: Params, batch: Any):
-        quantiles = network.apply(params, batch.obs)
-        value = quantile_huber_loss(quantiles, batch.returns[:, None], kappa=KAPPA) / KAPPA
+        obs, returns = batch
+        quantiles = network.apply(params, obs)
+        value = quantile_huber_loss(quantiles, returns[:, None], kappa=KAPPA) / KAPPA
         return value.mean(), {}
 
     rates = {"learning_rate": LEARNING_RATE, "learning_rate_end": 0.0, "max_grad_norm": 0.5}

@@ -1,11 +1,9 @@
 """Metrics and evaluations as JSON lines, and the learning curve. Imports neither JAX nor pyplot."""
 
-import contextlib
 import io
 import itertools
 import math
 import os
-from array import array
 from collections import Counter
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -39,27 +37,23 @@ class MetricsFile:
         self.path, self.first_seed, self.seeds = path, config.seed, config.num_seeds
         self.samples = config.samples_per_iteration
         self.iteration, self.seconds, self.skipped = 0, 0.0, 0
-        self.returns = array("d")
+        self.returns: list[float] = []
         """Episode returns of the rows so far, NaN where there was none."""
-        end = 0
-        with contextlib.suppress(OSError, ArithmeticError, LookupError, TypeError, ValueError):
-            for row, behind in itertools.islice(files.whole_rows(path), done * self.seeds):
-                iteration, seed = divmod(len(self.returns), self.seeds)
-                expected = iteration + 1, config.seed + seed
-                whole = (row["iteration"], row["seed"]) == expected
-                if not (whole and 0 <= row["seconds"] < math.inf):
-                    break
-                self._count(row)
-                end = behind
+        path.touch()
+        end, expected = 0, itertools.product(range(1, done + 1), range(self.seeds))
+        for (iteration, i), (row, behind) in zip(expected, files.whole_rows(path), strict=False):
+            if (row.get("iteration"), row.get("seed")) != (iteration, config.seed + i):
+                break
+            self._count(row)
+            end = behind
         if len(self.returns) != done * self.seeds:
             must = f"must hold the {done:,} iterations of the checkpoint, one row per seed"
             raise ConfigError(f"{path}: {must}")
-        path.touch()
         os.truncate(path, end)
 
     def _count(self, row: dict[str, Any]) -> None:
         value = row["episode_return"]
-        self.iteration, self.seconds = row["iteration"], float(row["seconds"])
+        self.iteration, self.seconds = row["iteration"], row["seconds"]
         self.returns.append(math.nan if value is None else value)
         self.skipped += bool(row.get("skipped"))
 
@@ -93,11 +87,10 @@ class EvaluationsFile:
     """`evaluations.jsonl`: one row per seed and periodic evaluation."""
 
     def __init__(self, path: Path):
-        """Read the rows that are there."""
+        """Read the rows that are there; returns that are not finite do not count."""
         self.path = path
-        self.rows: list[dict[str, Any]] = []
-        with contextlib.suppress(OSError):
-            self.rows = [row for row, _ in files.whole_rows(path) if _is_evaluation(row)]
+        found = read(path) if path.exists() else []
+        self.rows = [row for row in found if row.get("return_mean") is not None]
 
     def cut(self, steps: int, seeds: int) -> None:
         """Remove what followed the first `steps` samples, and evaluations that lack a seed."""
@@ -111,13 +104,12 @@ class EvaluationsFile:
         return any(row["steps"] == steps for row in self.rows)
 
     def append(self, steps: int, result: dict[str, Any]) -> list[dict[str, Any]]:
-        """Append an evaluation after `steps` samples; return its rows with finite returns."""
+        """Append an evaluation after `steps` samples; return its rows."""
         kept = "seed", "return_mean", "return_std", "returns"
         rows = [{"steps": steps, **{k: one[k] for k in kept}} for one in result["seeds"]]
         files.append_rows(self.path, rows)
-        counted = [row for row in rows if _is_evaluation(row)]
-        self.rows += counted
-        return counted
+        self.rows = EvaluationsFile(self.path).rows
+        return [row for row in self.rows if row["steps"] == steps]
 
     def points(self) -> np.ndarray:
         """Return steps, mean and standard deviation of every row [E, 3]."""
@@ -131,13 +123,6 @@ class EvaluationsFile:
         seeds = Counter(steps)
         whole = [int(at) for at in seeds if seeds[at] == max(seeds.values())]
         return max(whole, key=lambda at: (mean[steps == at].mean(), at), default=None)
-
-
-def _is_evaluation(row: dict[str, Any]) -> bool:
-    steps, *numbers = (row.get(name) for name in ("steps", "seed", "return_mean", "return_std"))
-    counted = type(steps) is int and 0 <= steps < 2**53
-    finite = all(isinstance(x, float | int) and abs(x) < 1e30 for x in numbers)
-    return counted and finite and row["return_std"] >= 0
 
 
 def learning_curve(

@@ -256,21 +256,9 @@ def _start_jax(config: ResolvedConfig) -> None:
 
 
 def use_cache(cache_dir: str) -> None:
-    """Keep compiled programs in `cache_dir`, or nowhere if it is "none".
-
-    Raises:
-        ConfigError: it cannot be written.
-    """
-    if cache_dir == "none":
-        jax.config.update("jax_enable_compilation_cache", False)
-        return
-    try:
-        path = Path(cache_dir).expanduser()
-        path.mkdir(parents=True, exist_ok=True)
-    except (OSError, RuntimeError) as reason:
-        allowed = f"a directory that can be written, or none ({reason})"
-        raise invalid("cache_dir", cache_dir, allowed) from reason
-    jax.config.update("jax_compilation_cache_dir", str(path))
+    """Keep compiled programs in `cache_dir`, or nowhere if it is "none"."""
+    jax.config.update("jax_enable_compilation_cache", cache_dir != "none")
+    jax.config.update("jax_compilation_cache_dir", str(Path(cache_dir).expanduser()))
 
 
 def hardware() -> dict[str, Any]:
