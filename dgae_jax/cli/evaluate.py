@@ -78,7 +78,8 @@ def evaluate(args: EvaluateArguments) -> None:
     engine = engine_of(config, args.engine)
     from dgae_jax.run import evaluation
 
-    out = args.out or evaluation.default_path(args.run_dir, engine, args.checkpoint)
+    best = "-best" if args.checkpoint == "best" else ""
+    out = args.out_or(f"evaluation-{engine}{best}.json")
     how = {"engine": engine, "episodes": args.episodes, "seed": args.seed}
     with args.writing(out, config) as watch:
         result = evaluation.evaluate_run(

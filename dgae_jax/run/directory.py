@@ -53,7 +53,7 @@ def created(path: Path, config: ResolvedConfig, options: RunOptions) -> Iterator
         with _must_be("a directory that can be written", path):
             (path / "checkpoints").mkdir(exist_ok=True)
             files.write_json(path / "manifest.json", {**_part(options), "resumed": []})
-            write_config(path, config)
+            files.write_json(path / "config.json", to_dict(config))
         yield
 
 
@@ -67,11 +67,11 @@ def _must_be(what: str, path: Path) -> Iterator[None]:
 
 def _check_empty(path: Path) -> None:
     """Refuse a directory that holds more than `created` leaves when it is killed."""
-    left = {"manifest.json", "manifest.json.part", "config.json.part"}
     for each in path.iterdir():
+        left = each.name == "manifest.json" or each.suffix == ".part"
         unused = each.name == "metrics.jsonl" and not each.lstat().st_size
         empty = each.name == "checkpoints" and not (each.is_symlink() or any(each.iterdir()))
-        if not (each.name in left or unused or empty):
+        if not (left or unused or empty):
             raise invalid("run_dir", path, "a new or empty directory")
 
 
@@ -117,9 +117,6 @@ def config_of(source: Path) -> ResolvedConfig:
 def read_config(path: Path) -> ResolvedConfig:
     """Return the configuration of a run directory; raise ConfigError if it has links or pipes."""
     with _must_be("a run directory", path):
-        if not path.is_dir():
-            there = "a file" if path.exists() else "nothing"
-            raise ConfigError(f"{path}: must be a run directory; there is {there} of that name")
         for each in [*path.iterdir(), *path.glob("checkpoints/*")]:
             if each.is_symlink() or each.is_fifo():
                 raise ConfigError(f"{each}: must be a file or directory, not a link or pipe")
@@ -136,13 +133,9 @@ def read_config_file(path: Path) -> ResolvedConfig:
         raise ConfigError(f"{path}: {reason}") from reason
 
 
-def write_config(path: Path, config: ResolvedConfig) -> None:
-    """Write `config.json` of the run directory `path`."""
-    files.write_json(path / "config.json", to_dict(config))
-
-
-def extend_manifest(run_dir: Path, options: RunOptions) -> None:
-    """Add the part that resumes a run to `manifest.json`."""
+def continue_run(run_dir: Path, config: ResolvedConfig, options: RunOptions) -> None:
+    """Write the configuration, and add the part that resumes a run to `manifest.json`."""
+    files.write_json(run_dir / "config.json", to_dict(config))
     before = files.read_object(run_dir / "manifest.json")
     resumed = [*before.get("resumed", []), _part(options)]
     files.write_json(run_dir / "manifest.json", {**before, "resumed": resumed})
@@ -196,13 +189,13 @@ def _version(name: str) -> str | None:
 
 def _git_revision() -> str | None:
     """Return the commit, `+` appended where files differ from it; None outside a checkout."""
-    folder, file = Path(__file__).parent, Path(__file__).name
-    # a busy machine takes its time, and None in a checkout would refuse a resume
-    how: dict[str, Any] = {"cwd": folder, "capture_output": True, "text": True, "timeout": 60}
+    root = Path(__file__).parents[2]
+    if not (root / ".git").exists():  # installed, perhaps inside another repository
+        return None
     version = ["git", "describe", "--always", "--dirty=+", "--abbrev=40", "--exclude=*"]
     try:
-        # not of a repository around it
-        subprocess.run(["git", "ls-files", "--error-unmatch", file], check=True, **how)
-        return subprocess.run(version, check=True, **how).stdout.strip()
+        # a busy machine takes its time, and None in a checkout would refuse a resume
+        how: dict[str, Any] = {"capture_output": True, "text": True, "timeout": 60}
+        return subprocess.run(version, cwd=root, check=True, **how).stdout.strip()
     except (OSError, subprocess.SubprocessError):
         return None

@@ -11,17 +11,11 @@ import numpy as np
 from dgae_jax.configs.resolved import ResolvedConfig
 from dgae_jax.learn.types import InferenceState
 from dgae_jax.maths.statistics import bootstrap_interval, iqm, sample_cvar
-from dgae_jax.run import checkpoint, files
+from dgae_jax.run import checkpoint
 from dgae_jax.run.episodes import gymnasium_returns, jax_returns
 from dgae_jax.run.options import engine_of, eval_env_id
 from dgae_jax.run.runtime import Watch, unwatched
 from dgae_jax.run.terminal import counted
-
-
-def default_path(source: Path, engine: str, which: str) -> Path:
-    """Return the file of an evaluation, one per engine and choice of checkpoint."""
-    suffix = "" if which == "latest" else f"-{which}"
-    return files.beside(source, f"evaluation-{engine}{suffix}.json")
 
 
 def evaluate_run(

@@ -1,7 +1,6 @@
 """Files that are written atomically, and files of JSON lines that grow."""
 
 import contextlib
-import fcntl
 import json
 import math
 import os
@@ -12,7 +11,7 @@ from typing import Any
 
 def replace(path: Path, data: bytes) -> None:
     """Write a file atomically: a crash at any byte leaves the old content. No link is followed."""
-    part = path.with_name(path.name + ".part")
+    part = path.with_name(f"{path.name}.{os.getpid()}.part")
     with _naming(path):
         part.unlink(missing_ok=True)  # of a crash, or a link that was laid there
         try:
@@ -23,26 +22,10 @@ def replace(path: Path, data: bytes) -> None:
             part.replace(path)
         finally:
             part.unlink(missing_ok=True)
-        with _descriptor(path.parent) as directory, contextlib.suppress(OSError):
-            os.fsync(directory)  # or the rename may be lost; some network file systems cannot
-
-
-@contextlib.contextmanager
-def turn(directory: Path) -> Iterator[None]:
-    """Let one process at a time write the files in a directory, where there are locks."""
-    with _descriptor(directory) as descriptor:
-        with contextlib.suppress(OSError):  # some network file systems have none
-            fcntl.flock(descriptor, fcntl.LOCK_EX)
-        yield
-
-
-@contextlib.contextmanager
-def _descriptor(directory: Path) -> Iterator[int]:
-    descriptor = os.open(directory, os.O_RDONLY)
-    try:
-        yield descriptor
-    finally:
-        os.close(descriptor)
+        directory = os.open(path.parent, os.O_RDONLY)
+        with contextlib.suppress(OSError):  # some network file systems cannot
+            os.fsync(directory)  # or the rename may be lost
+        os.close(directory)
 
 
 def beside(source: Path, name: str) -> Path:

@@ -91,8 +91,7 @@ def train(
             done = 0 if state is None else int(state.iteration[0])
             with RunLogger(run_dir, config, options, done) as logger:
                 if not new:
-                    directory.write_config(run_dir, config)
-                    directory.extend_manifest(run_dir, options)
+                    directory.continue_run(run_dir, config, options)
                 state = _iterate(logger, signals, state, on_eval)
                 if skipped := logger.metrics.skipped:
                     terminal.warn(f"warning: {skipped:,} iterations skipped a non-finite update")

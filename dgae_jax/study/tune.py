@@ -19,7 +19,7 @@ from optuna.trial import FrozenTrial, Trial, TrialState
 
 from dgae_jax.configs.config import ConfigError, invalid
 from dgae_jax.configs.serial import to_dict
-from dgae_jax.run import files, terminal, training
+from dgae_jax.run import terminal, training
 from dgae_jax.run.options import engine_of
 from dgae_jax.run.runtime import Signals
 from dgae_jax.run.training import DivergedError, RunError
@@ -60,8 +60,7 @@ def tune(tuning: Tuning) -> int:
             said = f"{done} of {tuning.trials} trials are finished; the same command continues"
             terminal.say(f"stopped {how}: {said}")
             return signals.exit_code if signals.received else 1
-        with files.turn(tuning.directory):
-            return outcome.write(tuning, study)
+        return outcome.write(tuning, study)
     except OSError as reason:
         allowed = f"a directory that can be written ({reason.strerror})"
         raise invalid("study", tuning.directory, allowed) from reason

@@ -61,7 +61,7 @@ def test_names_and_numbers_of_other_trainers_are_understood(words, setting, valu
         ("train --algo pop", "invalid choice 'pop'"),
         ("train --nun-envs 3", "Perhaps you meant: --n-envs, --num-envs INT"),
         ("evaluate", "RUN-DIR Directory of the run"),
-        ("evaluate nowhere", "nowhere: must be a run directory; there is nothing of that name"),
+        ("evaluate nowhere", "nowhere: must be a run directory (No such file"),
         ("refit . --num-envs 0", "0: must be a whole number from 1 to 10,000"),
         ("reproduce x --seeds 0 -1", "--seeds 0 -1: must be whole numbers from 0 to"),
         ("reproduce x --env hopper", "--env, --algo: a sweep has"),

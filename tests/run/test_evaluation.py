@@ -9,7 +9,6 @@ from dgae_jax.configs.config import ConfigError, NoiseConfig
 from dgae_jax.learn.build import make_task, make_trainer, policies_of, seed_keys
 from dgae_jax.run import episodes
 from dgae_jax.run.evaluation import (
-    default_path,
     describe,
     evaluate_policies,
     seed_statistics,
@@ -25,15 +24,13 @@ def policies(config):
     return policies_of(make_trainer(make_task(config), 1).init(config, seed_keys(config)))
 
 
-def test_engines_of_a_run_and_their_files(tmp_path):
+def test_engines_of_a_run():
     assert engines_of(SMALL)[0] == "gymnasium"
     assert {"native", "jax"} <= set(engines_of(SMALL))
     ant = dataclasses.replace(SMALL, env="brax:ant", physics="mjx")
     assert engines_of(ant) == ("mjx",)
     with pytest.raises(ConfigError, match="engine gymnasium: must be one of mjx with brax:ant"):
         evaluate_policies(None, ant, engine="gymnasium", episodes=1)
-    assert default_path(tmp_path, "native", "latest").name == "evaluation-native.json"
-    assert default_path(tmp_path, "jax", "best").name == "evaluation-jax-best.json"
 
 
 @pytest.mark.parametrize("engine", ENGINES)

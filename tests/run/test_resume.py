@@ -93,7 +93,7 @@ def test_damaged_run_is_refused_and_left_as_it_was(run_dir):
 def test_resumed_run_keeps_its_options(run_dir):
     kept = {"episodes": 1, "checkpoint_every": QUIET.checkpoint_every, "devices": 1}
     assert directory.saved_options(run_dir) == RunOptions(**kept)
-    directory.extend_manifest(run_dir, RunOptions(episodes=7, log=["tensorboard"]))
+    directory.continue_run(run_dir, small(), RunOptions(episodes=7, log=["tensorboard"]))
     assert directory.saved_options(run_dir) == RunOptions(episodes=7, log=("tensorboard",))
 
 
