@@ -33,13 +33,11 @@ class TensorBoard:
 
     id = None
 
-    def __init__(
-        self, run_dir: Path, name: str, seed: int, settings: dict[str, Any], run_id: str | None
-    ):
+    def __init__(self, run_dir: Path, name: str, settings: dict[str, Any], run_id: str | None):
         from tensorboardX.event_file_writer import EventsWriter
         from tensorboardX.summary import text
 
-        folder = run_dir / "tensorboard" / f"seed_{seed}"
+        folder = run_dir / "tensorboard" / f"seed_{settings['seed']}"
         folder.mkdir(parents=True, exist_ok=True)
         self.writer = EventsWriter(str(folder / "events"))
         rows = [f"| {path} | {value} |" for path, value in settings.items()]
@@ -76,9 +74,7 @@ class WeightsAndBiases:
     WANDB_MODE, WANDB_PROJECT and WANDB_ENTITY keep their meaning.
     """
 
-    def __init__(
-        self, run_dir: Path, name: str, seed: int, settings: dict[str, Any], run_id: str | None
-    ):
+    def __init__(self, run_dir: Path, name: str, settings: dict[str, Any], run_id: str | None):
         import requests
         import wandb
 
@@ -123,9 +119,7 @@ class MLflow:
     MLflow refuses to write its older store of plain files. The picture is sent to a server only.
     """
 
-    def __init__(
-        self, run_dir: Path, name: str, seed: int, settings: dict[str, Any], run_id: str | None
-    ):
+    def __init__(self, run_dir: Path, name: str, settings: dict[str, Any], run_id: str | None):
         os.environ.setdefault("MLFLOW_DISABLE_TELEMETRY", "true")
         os.environ.setdefault("MLFLOW_LOGGING_LEVEL", "WARNING")
         from mlflow import MlflowClient
@@ -167,8 +161,8 @@ LOGGERS: dict[str, Callable[..., Any]] = {
     "wandb": WeightsAndBiases,
     "mlflow": MLflow,
 }
-"""Loggers of one seed: made with the run directory, the name of their run, the seed, the
-configuration by path, and the `id` that they had before."""
+"""Loggers of one seed: made with the run directory, the name of their run, the configuration by
+path, and the `id` that they had before."""
 
 
 class LoggerFeed:
@@ -215,8 +209,7 @@ class LoggerFeed:
             title = self.run_dir.resolve().name + (f"-seed-{seed}" if count > 1 else "")
             values = flat(to_dict(dataclasses.replace(self.config, seed=seed)))
             settings = {path: value for path, value in values.items() if value is not None}
-            run_id = state["ids"].get(str(seed))
-            logger = LOGGERS[name](self.run_dir, title, seed, settings, run_id)
+            logger = LOGGERS[name](self.run_dir, title, settings, state["ids"].get(str(seed)))
             self.open[name].append(logger)
             state["ids"][str(seed)] = logger.id
 

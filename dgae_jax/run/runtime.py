@@ -212,17 +212,23 @@ def use_devices(config: ResolvedConfig, options: RunOptions) -> int:
         ConfigError: the devices do not exist, or do not divide the envs or the seeds.
     """
     join_processes(options)
-    wanted = options.devices
-    if spec_of(config.env).on_host:
-        if wanted not in (None, 1) or jax.distributed.is_initialized():
-            raise invalid("devices", wanted, f"1, in one process, with {config.env}")
-        wanted = 1
+    on_host = spec_of(config.env).on_host
+    wanted = 1 if on_host and options.devices is None else options.devices
     with contextlib.suppress(RuntimeError):  # JAX runs already, and has the devices that it has
         divide_cpu(wanted or _dividing(config, cores(), ENVS_PER_CORE))
-    _start_jax(config)
+    try:
+        backend = jax.default_backend()
+    except Exception as reason:  # of many kinds; an empty AssertionError for a missing plugin
+        given = f"JAX_PLATFORMS={os.environ.get('JAX_PLATFORMS', '')}"
+        why = f"must name a device that JAX finds here ({str(reason) or type(reason).__name__})"
+        gpu = 'an NVIDIA GPU needs pip install "dgae_jax[cuda13]"'
+        raise ConfigError(f"{given}: {why}; {gpu}") from reason
     there, processes = jax.local_device_count(), jax.process_count()
+    if on_host and (wanted, processes, backend) != (1, 1, "cpu"):
+        limit = f"1, in one process with JAX_PLATFORMS=cpu, with {config.env}"
+        raise invalid("devices", wanted, limit)
     if wanted is None and processes == 1:
-        return _dividing(config, there, ENVS_PER_CORE if jax.default_backend() == "cpu" else 1)
+        return _dividing(config, there, ENVS_PER_CORE if backend == "cpu" else 1)
     count = wanted or there
     if count > there or (count < there and processes > 1):
         limit = f"at most {there}, which JAX has started with, and all with several processes"
@@ -241,18 +247,6 @@ def _dividing(config: ResolvedConfig, most: int, envs_each: int) -> int:
         if seeds or (config.num_envs % count == 0 and config.num_envs >= count * envs_each):
             return count
     return 1
-
-
-def _start_jax(config: ResolvedConfig) -> None:
-    wanted = os.environ.get("JAX_PLATFORMS", "")
-    try:
-        kind = jax.devices()[0].platform
-    except Exception as reason:  # of many kinds; an empty AssertionError for a missing plugin
-        why = f"must name a device that JAX finds here ({str(reason) or type(reason).__name__})"
-        gpu = 'an NVIDIA GPU needs pip install "dgae_jax[cuda13]"'
-        raise ConfigError(f"JAX_PLATFORMS={wanted}: {why}; {gpu}") from reason
-    if spec_of(config.env).on_host and kind != "cpu":
-        raise ConfigError(f"JAX_PLATFORMS={wanted}: must be cpu with {config.env}, not {kind}")
 
 
 def use_cache(cache_dir: str) -> None:

@@ -18,9 +18,6 @@ LINE_SECONDS = 10.0
 PICTURE_SECONDS = 4.0
 """Least time between two pictures in a notebook."""
 
-PICTURE_WIDTH = 640
-"""Width of a picture in a notebook [CSS pixels]."""
-
 _silent: ContextVar[bool] = ContextVar("silent", default=False)
 
 
@@ -54,9 +51,7 @@ def is_live() -> bool:
 
 def in_notebook() -> bool:
     """Return whether this process is the kernel of a notebook and not silenced."""
-    ipython: Any = sys.modules.get("IPython")
-    shell = ipython.get_ipython() if ipython else None
-    return getattr(shell, "kernel", None) is not None and not _silent.get()
+    return "ipykernel" in sys.modules and not _silent.get()
 
 
 def write(stream: Any, text: str) -> None:
@@ -102,7 +97,7 @@ class Page:
         if time.monotonic() < self.due and not at_once:
             return
         png = self.draw(text)
-        output = Pretty(text) if png is None else Image(png, width=PICTURE_WIDTH)
+        output = Pretty(text) if png is None else Image(png, width=640)
         if self.shown is None:
             self.shown = display(output, display_id=True)
         else:

@@ -29,7 +29,7 @@ PENDULUM = config_for("gymnasium:Pendulum-v1")
 
 
 def test_impossible_gymnasium_run_is_refused_before_writing(tmp_path):
-    message = "devices 2: must be 1, in one process, with gymnasium:Pend"
+    message = "devices 2: must be 1, in one process with JAX_PLATFORMS=cpu, with gymnasium:Pend"
     with pytest.raises(ConfigError, match=message):
         dg.train(PENDULUM, tmp_path / "run", devices=2, **CHOSEN)
     message = "env gymnasium:Nope-v1: must be a task that can be built .*NameNotFound"

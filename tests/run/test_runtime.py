@@ -8,6 +8,7 @@ import socket
 import subprocess
 import sys
 import time
+from unittest.mock import Mock
 
 import jax
 import numpy as np
@@ -150,10 +151,7 @@ def test_processes_of_a_scheduler_are_joined(environment, several, monkeypatch):
 
 
 def test_missing_device_says_what_to_install(monkeypatch):
-    def devices():
-        raise AssertionError
-
-    monkeypatch.setattr(jax, "devices", devices)
+    monkeypatch.setattr(jax, "default_backend", Mock(side_effect=AssertionError))
     monkeypatch.setenv("JAX_PLATFORMS", "cuda")
     message = r"^JAX_PLATFORMS=cuda: must .* \(AssertionError\); .*dgae_jax\[cuda13\]"
     with pytest.raises(ConfigError, match=message):

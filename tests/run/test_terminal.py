@@ -86,19 +86,8 @@ def cell(monkeypatch):
         history.append(output)
         return SimpleNamespace(update=display)
 
-    monkeypatch.setattr("IPython.get_ipython", lambda: SimpleNamespace(kernel="a kernel"))
     monkeypatch.setattr("IPython.display.display", display)
     return history
-
-
-def test_only_a_kernel_has_a_page(cell, monkeypatch):
-    assert terminal.in_notebook()
-    with terminal.silenced():
-        assert not terminal.in_notebook()
-    monkeypatch.setattr("IPython.get_ipython", lambda: None)  # imported by a program
-    assert not terminal.in_notebook()
-    monkeypatch.delitem(sys.modules, "IPython")
-    assert not terminal.in_notebook()
 
 
 def test_page_has_text_and_later_the_curve(cell, capsys):
