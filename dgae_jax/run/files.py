@@ -68,10 +68,10 @@ def append_rows(path: Path, rows: Iterable[dict[str, Any]]) -> None:
         os.fsync(file.fileno())
 
 
-def whole_rows(path: Path, end: int = 0) -> Iterator[tuple[dict[str, Any], int]]:
-    """Yield each row of JSON lines behind the offset `end`, and its end, up to a damaged line."""
+def whole_rows(path: Path) -> Iterator[tuple[dict[str, Any], int]]:
+    """Yield each row of JSON lines and the offset of its end, up to a damaged line."""
+    end = 0
     with path.open("rb") as file:
-        file.seek(end)
         for line in file:
             end += len(line)
             try:

@@ -17,9 +17,6 @@ from dgae_jax.run import files
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-MAX_POINTS = 1000
-"""Most points of a plotted line, about as many as the picture has columns."""
-
 
 def read(path: Path) -> list[dict[str, Any]]:
     """Return the rows of a `metrics.jsonl` up to a damaged line."""
@@ -136,9 +133,7 @@ def learning_curve(
     from matplotlib.ticker import EngFormatter
 
     axes = Figure(figsize=(6.4, 4.0), layout="constrained", dpi=150).subplots()
-    drawn = np.linspace(0, len(steps) - 1, min(len(steps), MAX_POINTS)).astype(int)
-    steps, returns, seeds = steps[drawn], returns[drawn], returns.shape[1]
-    mean, std, label = returns.mean(1), returns.std(1), "training"
+    mean, std, seeds, label = returns.mean(1), returns.std(1), returns.shape[1], "training"
     blue: dict[str, Any] = {"color": "tab:blue"}
     if seeds > 1:
         axes.plot(steps, returns, linewidth=0.8, alpha=0.4, **blue)

@@ -1,8 +1,10 @@
-"""Devices, processes, signals: two processes of one machine in place of several hosts."""
+"""Devices, processes, kills and signals; two processes in place of several hosts."""
 
 import importlib
 import json
 import os
+import random
+import shutil
 import signal
 import socket
 import subprocess
@@ -19,7 +21,7 @@ from dgae_jax.run import checkpoint, directory, runtime
 from dgae_jax.run.options import RunOptions
 from dgae_jax.run.runtime import Signals, Stopped
 from tests.helpers import ROOT, TINY
-from tests.runs import SMALL, assert_same, stopped_half_way, timeless
+from tests.runs import SMALL, assert_same, each_signal, last, stopped_half_way, timeless
 
 FLAGS = [*TINY, "--total-steps", "512", "--checkpoint-every", "256", "--episodes", "1"]
 CACHE = TINY[-2:]
@@ -181,3 +183,44 @@ def test_nohup_is_respected():
         os.kill(os.getpid(), signal.SIGHUP)
     assert (signals.received, signal.getsignal(signal.SIGHUP)) == (None, signal.SIG_IGN)
     signal.signal(signal.SIGHUP, before)
+
+
+def start(run_dir):
+    """Start or resume a run of 40 iterations with a checkpoint after each fifth."""
+    flags = ["--run-dir", run_dir, "--total-steps", 40 * 64, "--checkpoint-every", 5 * 64]
+    return begun("--resume-or-start", *flags, "--episodes", 1, *TINY)
+
+
+@pytest.mark.slow
+def test_kills_at_random_moments_lose_nothing(tmp_path):
+    whole, killed, chance = tmp_path / "whole", tmp_path / "killed", random.Random(0)
+    assert start(whole).wait() == 0
+    since = time.monotonic()
+    assert start(tmp_path / "again").wait() == 0  # with the compiled programs of the first
+    usual = time.monotonic() - since
+    kills = 0
+    while kills < 25:
+        process = start(killed)
+        time.sleep(chance.uniform(0.3, 1.05) * usual)
+        if process.poll() is None:
+            process.kill()
+            kills += 1
+        process.wait()
+        if (killed / "evaluation.json").exists():  # it got through: the next begins again
+            assert last(killed).read_bytes() == last(whole).read_bytes()
+            shutil.rmtree(killed)
+    assert start(killed).wait() == 0
+    assert_same(killed, whole)
+
+
+@each_signal
+def test_signal_breaks_off_compilation(kind, code, tmp_path):
+    layers = [8] * 16  # several seconds of compilation
+    run_dir, hidden = tmp_path / "run", ["--policy.hidden", *layers, "--critic.hidden", *layers]
+    process = begun("--run-dir", run_dir, "--total-steps", 640, *TINY, *hidden)
+    assert process.stdout.readline().startswith("hopper-v4")
+    process.send_signal(kind)
+    ((out, _, ended),) = finished([process])
+    said = f"stopped by {kind.name}; continue with --resume {run_dir}\n"
+    assert (ended, out) == (code, said)
+    assert (run_dir / "metrics.jsonl").read_bytes() == b""
