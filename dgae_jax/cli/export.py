@@ -10,7 +10,7 @@ from dgae_jax.cli import parse
 from dgae_jax.cli.evaluate import PolicyArguments, titles
 from dgae_jax.configs.config import ConfigError, invalid
 from dgae_jax.envs.registry import TASKS, spec_of
-from dgae_jax.export import encoding, gl, onnx_model
+from dgae_jax.export import encoding, gl
 from dgae_jax.run import terminal
 
 
@@ -27,7 +27,7 @@ class ExportArguments(PolicyArguments):
 def export(args: ExportArguments) -> None:
     """Export one policy."""
     if "onnx" in args.to:
-        onnx_model.check_installed()
+        parse.require("onnx", "export")
     config = args.config_of(args.run_dir)
     if "gymnasium" in args.to and spec_of(config.env).eval_env() is None:
         raise invalid("to", "gymnasium", f"left out with {config.env}, which Gymnasium lacks")
@@ -78,7 +78,7 @@ def render(args: RenderArguments) -> None:
     if args.during and (args.compare or args.checkpoint == "best" or args.run_dir.is_file()):
         others = "--compare, --checkpoint best or the file of a single policy"
         raise ConfigError(f"--during: cannot be combined with {others}")
-    encoding.check_installed()
+    parse.require("imageio_ffmpeg", "video")
     sources = [args.run_dir, *args.compare]
     if any(path.is_file() for path in sources):
         gl.choose()  # reading a policy's file imports MuJoCo

@@ -12,6 +12,7 @@ import math
 import os
 import sys
 from collections.abc import Callable, Iterator, Sequence
+from importlib.util import find_spec
 from pathlib import Path
 from types import NoneType
 from typing import Annotated, Any, Literal, NamedTuple, NoReturn, get_args
@@ -237,6 +238,12 @@ def interrupted() -> int:
     if runtime and runtime.is_compiling():
         os._exit(130)
     return 130
+
+
+def require(package: str, extra: str) -> None:
+    """Raise ConfigError, naming what to install, unless a package is here."""
+    if find_spec(package) is None:
+        raise ConfigError(f'{package} is not installed: pip install "dgae_jax[{extra}]"')
 
 
 @contextlib.contextmanager

@@ -2,7 +2,6 @@
 
 import dataclasses
 from dataclasses import dataclass
-from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -77,8 +76,7 @@ def parsed(argv: list[str]) -> "Tuning":
 def _storage(url: str | None) -> str | None:
     """Return the address as SQLAlchemy takes it, with the driver that we install."""
     for name in ("optuna", "psycopg"):
-        if find_spec(name) is None:
-            raise ConfigError(f'{name}: must be installed: pip install "dgae_jax[tune]"')
+        parse.require(name, "tune")
     scheme, _, rest = (url or "").partition("://")
     if url and not (rest and scheme in ("postgresql", "postgres", "postgresql+psycopg")):
         # the address may have a password

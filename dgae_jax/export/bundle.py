@@ -41,26 +41,20 @@ def export(
     found = checkpoint.load_networks(source, config, which)
     arrays = arrays_of(found, config, index)
     facts = facts_of(source, found.path, config, index) | {"best": which == "best"}
-    bundles = {kind: _files(kind, arrays, config, index, facts) for kind in formats}
+    bundles = {}
+    for kind in formats:
+        if kind == "onnx":
+            bundles[kind] = {"policy.onnx": onnx_model.serialize(arrays)}
+        else:
+            programs = ("policy.py", "agent.py") if kind == "gymnasium" else ("policy.py",)
+            copies = {name: (TEMPLATES / name).read_bytes() for name in programs}
+            bundles[kind] = {"policy.npz": to_npz(arrays), **copies}
+        bundles[kind]["README.md"] = model_card(kind, arrays, config, index, facts).encode()
     for kind, contents in bundles.items():
         (out / kind).mkdir(parents=True, exist_ok=True)
         for name, data in contents.items():
             files.replace(out / kind / name, data)
     return {kind: list(contents) for kind, contents in bundles.items()}
-
-
-def _files(
-    kind: str, arrays: Arrays, config: ResolvedConfig, index: int, facts: dict[str, Any]
-) -> dict[str, bytes]:
-    card = {"README.md": model_card(kind, arrays, config, index, facts).encode()}
-    if kind == "onnx":
-        metadata = {"task": str(arrays["env"]), "algorithm": config.algo}
-        known = {name: facts[name] for name in ("samples", "git_revision") if facts[name]}
-        metadata |= {name: str(value) for name, value in known.items()}
-        return {"policy.onnx": onnx_model.serialize(arrays, metadata), **card}
-    programs = ("policy.py", "agent.py") if kind == "gymnasium" else ("policy.py",)
-    copies = {name: (TEMPLATES / name).read_bytes() for name in programs}
-    return {"policy.npz": to_npz(arrays), **copies, **card}
 
 
 def model_card(

@@ -4,13 +4,11 @@ import math
 import subprocess
 import tempfile
 from collections.abc import Iterator
-from importlib.util import find_spec
 from itertools import chain
 from pathlib import Path
 
 import numpy as np
 
-from dgae_jax.configs.config import ConfigError
 from dgae_jax.run import files
 
 FORMATS = {"mp4": ("mp4",), "gif": ("gif",), "both": ("mp4", "gif")}
@@ -21,12 +19,6 @@ GIF_FILTER = (
     "[a]palettegen=max_colors=64[p];[b][p]paletteuse=dither=none"
 )
 """At most 640 pixels wide, without dithering: then what stands still costs nothing."""
-
-
-def check_installed() -> None:
-    """Raise ConfigError, naming what to install, unless videos can be encoded here."""
-    if find_spec("imageio_ffmpeg") is None:
-        raise ConfigError('imageio-ffmpeg is not installed: pip install "dgae_jax[video]"')
 
 
 def write(

@@ -1,6 +1,5 @@
 """Figures of the paper that need no training."""
 
-import io
 from pathlib import Path
 from statistics import NormalDist
 from typing import Any
@@ -13,7 +12,7 @@ from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.patches import FancyArrowPatch
 
 from dgae_jax.maths.transport import directional_metric, quantile_midpoints, wasserstein
-from dgae_jax.run import files
+from dgae_jax.run import metrics
 
 COLORS = {
     "black": "#000000",
@@ -45,12 +44,10 @@ LEVELS = (0.1, 0.3, 0.5, 0.7, 0.9)
 """Probabilities at which the transfer plan is drawn."""
 
 
-def save(figure: Figure, path: Path, dpi: int = 200) -> None:
+def save(figure: Figure, path: Path) -> None:
     """Write a PNG or an SVG, by the suffix of `path`, complete or not at all."""
-    image, frame = io.BytesIO(), {"bbox_inches": "tight", "pad_inches": 0.03}
     with matplotlib.rc_context(fname=STYLE):
-        figure.savefig(image, format=path.suffix[1:], dpi=dpi, metadata={"Date": None}, **frame)
-    files.replace(path, image.getvalue())
+        metrics.save_figure(figure, path)
 
 
 def robots() -> Figure:

@@ -4,26 +4,15 @@ The model maps obs [batch, O] to action [batch, A] and quantiles [batch, K], all
 """
 
 from collections.abc import Mapping
-from importlib.util import find_spec
 
 import numpy as np
-
-from dgae_jax.configs.config import ConfigError
 
 HEADER = '<ir_version: 7, opset_import: ["": 13], producer_name: "dgae_jax">'
 """Versions of 2020, which older runtimes read too."""
 
 
-def check_installed() -> None:
-    """Raise ConfigError, naming what to install, unless the package onnx is here."""
-    if find_spec("onnx") is None:
-        raise ConfigError(
-            'onnx is not installed: pip install "dgae_jax[export]", or leave out --to onnx'
-        )
-
-
-def serialize(arrays: Mapping[str, np.ndarray], metadata: Mapping[str, str]) -> bytes:
-    """Return the bytes of an `.onnx` file with these arrays and metadata, checked by ONNX."""
+def serialize(arrays: Mapping[str, np.ndarray]) -> bytes:
+    """Return the bytes of an `.onnx` file with these arrays, checked by ONNX."""
     import onnx
 
     nodes = [
@@ -61,7 +50,6 @@ def serialize(arrays: Mapping[str, np.ndarray], metadata: Mapping[str, str]) -> 
     model.graph.initializer.extend(
         onnx.numpy_helper.from_array(np.asarray(x), name) for name, x in constants.items()
     )
-    onnx.helper.set_model_props(model, dict(metadata))
     onnx.checker.check_model(model, full_check=True)
     return model.SerializeToString()
 

@@ -32,8 +32,6 @@ class Episode(NamedTuple):
     """Undiscounted return so far."""
     quantiles: Float[np.ndarray, "T K"]
     """Of the critic, sorted; a scalar critic has one."""
-    value: Float[np.ndarray, " T"]
-    """The risk measure of the quantiles."""
     discounted: Float[np.ndarray, " T"]
     """The discounted return that followed, in the critic's units."""
 
@@ -51,7 +49,10 @@ class Overlay:
         most = int(0.5 * width / (0.85 * size))
         title = episode.title if len(episode.title) <= most else "…" + episode.title[1 - most :]
         self._figure.text(0.02, 0.97, title, size=size + 1, weight="bold", va="top")
-        self._is_distribution = episode.quantiles.shape[-1] > 1
+        count = episode.quantiles.shape[-1]
+        weights = weights_of(episode.metric, count)
+        self._weights = np.ones(count) if weights is None else weights / weights.max()
+        self._is_distribution = count > 1
         moving = self._add_distribution(axes) if self._is_distribution else []
         name = f"its {episode.metric}" if self._is_distribution else "critic's value"
         style = {"color": COLORS["black"], "linestyle": (0, (2, 1))}
@@ -69,14 +70,13 @@ class Overlay:
 
     def render(self, t: int) -> UInt8[np.ndarray, "h W 3"]:
         """Draw the overlay at the t-th state."""
-        episode = self._episode
+        episode, z = self._episode, self._episode.quantiles[t]
         if self._is_distribution:
-            z = episode.quantiles[t]
             self._density.set_data(self._x, 0, density(z, self._x) / self._highest)
             self._rug.set_segments(
                 [[(q, 0), (q, -RUG * w)] for q, w in zip(z, self._weights, strict=True)]
             )
-        self._value.set_xdata([episode.value[t]] * 2)
+        self._value.set_xdata([np.average(z, weights=self._weights)] * 2)
         self._discounted.set_xdata([episode.discounted[t]] * 2)
         self._numbers.set_text(f"{t * episode.dt:.2f} s   return {episode.total[t]:,.0f}")
         self._canvas.restore_region(self._background)
@@ -87,8 +87,6 @@ class Overlay:
     def _add_distribution(self, axes: Any) -> list[Any]:
         """Add density and rug; each line of the rug is as long as its quantile's weight."""
         quantiles = self._episode.quantiles
-        weights = weights_of(self._episode.metric, quantiles.shape[-1])
-        self._weights = np.ones_like(quantiles[0]) if weights is None else weights / weights.max()
         low, high = axes.get_xlim()
         self._x = np.linspace(low, high, 200)
         peaks = [density(z, self._x).max() for z in quantiles[::10]]

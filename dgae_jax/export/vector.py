@@ -86,14 +86,13 @@ class VectorTask(VectorEnv):
         num_envs: int,
         mode: AutoresetMode,
         limit: int,
-        make_renderer: partial[Renderer] | None,
+        renderer: Renderer | None,
     ):
-        self.env, self.num_envs, self._mode = env, num_envs, mode
-        self._make_renderer, self._renderer = make_renderer, None
+        self.env, self.num_envs, self._mode, self._renderer = env, num_envs, mode, renderer
         self.metadata = {"autoreset_mode": mode, "render_modes": []}
         if isinstance(env, Task):
             self.metadata |= {"render_modes": ["rgb_array"], "render_fps": round(1 / env.dt)}
-        self.render_mode = None if make_renderer is None else "rgb_array"
+        self.render_mode = "rgb_array" if renderer else None
         keys = _keys_of(np.random.SeedSequence().generate_state(num_envs, np.uint64))
         shapes: Any = jax.eval_shape(jax.vmap(env.reset), keys)
         zeros = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
@@ -138,10 +137,6 @@ class VectorTask(VectorEnv):
         if isinstance(seed, int | np.integer):
             seeds = [int(seed) + i for i in range(count)]
         mask = np.asarray((options or {}).get("reset_mask", [True] * count))
-        if len(seeds) != count:
-            raise invalid("seed", seed, f"a number, or a list of {count}")
-        if mask.shape != (count,) or mask.dtype != bool:
-            raise invalid("reset_mask", mask, f"{count} booleans")
         given = jnp.asarray(mask & [s is not None for s in seeds])
         keys = where(given, _keys_of([s or 0 for s in seeds]), self._states.keys)
         self._states = self._reset(self._states._replace(keys=keys), mask)
@@ -177,9 +172,8 @@ class VectorTask(VectorEnv):
 
     def render(self) -> tuple[UInt8[np.ndarray, "H W 3"], ...] | None:
         """Return a picture of each env, or None without a render mode."""
-        if self._make_renderer is None:
+        if self._renderer is None:
             return None
-        self._renderer = self._renderer or self._make_renderer()
         return tuple(map(self._renderer.draw, np.asarray(self.state.pipeline_state.qpos)))
 
     def close_extras(self, **_: Any) -> None:
@@ -222,17 +216,15 @@ def make_vector_env(
     Raises:
         ValueError: an argument is invalid; the message names what is allowed.
     """
-    if num_envs < 1:
-        raise invalid("num_envs", num_envs, "at least 1")
     if render_mode is not None and (render_mode != "rgb_array" or name not in CAMERAS):
         allowed = f"left out, or rgb_array with {', '.join(CAMERAS)}"
         raise invalid("render_mode", render_mode, allowed)
     env = make_env(name, physics=physics, version=version, **task_parameters)
     if spec_of(name).on_host:
         raise invalid("name", name, "a task in JAX; use gymnasium.make_vec for Gymnasium's")
-    renderer = partial(Renderer, name, version, 480, 480)
-    mode, make_renderer = AutoresetMode(autoreset_mode), renderer if render_mode else None
-    return VectorTask(env, num_envs, mode, max_episode_steps, make_renderer)
+    mode = AutoresetMode(autoreset_mode)
+    renderer = Renderer(name, version, 480, 480) if render_mode else None
+    return VectorTask(env, num_envs, mode, max_episode_steps, renderer)
 
 
 for _name, _spec in TASKS.items():

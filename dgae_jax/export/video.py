@@ -4,7 +4,7 @@ import math
 from collections.abc import Iterable, Iterator, Sequence
 from itertools import islice, zip_longest
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -15,7 +15,6 @@ from dgae_jax.configs.resolved import ResolvedConfig
 from dgae_jax.export.overlay import Episode, Overlay
 from dgae_jax.export.renderer import Renderer
 from dgae_jax.maths.returns import lambda_sum
-from dgae_jax.maths.risk import weights_of
 from dgae_jax.run import checkpoint
 from dgae_jax.run.api import Policy
 from dgae_jax.run.calibration import MAX_RETURN_STEPS, steps_that_count
@@ -74,26 +73,26 @@ def play(actor: Actor, seed: int, seconds: float) -> Episode:
     dt = env.unwrapped.dt
     shown = min(config.episode_length, max(1, math.floor(seconds / dt)))
     most = shown + steps_that_count(config.gamma)
-    steps = list(islice(gymnasium_steps([env], actor.policy, [seed], _pose), most))
+    qpos = []
+
+    def act(obs: np.ndarray) -> np.ndarray:
+        qpos.append(env.unwrapped.data.qpos.copy())
+        return actor.policy(obs)
+
+    steps = list(islice(gymnasium_steps([env], act, [seed]), most))
     env.close()
     rewards = np.concatenate([step.reward for step in steps])
     followed = lambda_sum(jnp.asarray(rewards), jnp.full(len(rewards), config.gamma))
     obs = np.concatenate([step.obs for step in steps[:shown]])
-    quantiles = np.sort(actor.policy.quantiles(obs.astype(np.float32)))
     return Episode(
         actor.title,
         config.metric,
         dt,
-        qpos=np.stack([step.snapshots[0] for step in steps[:shown]]),
+        qpos=np.stack(qpos[:shown]),
         total=np.cumsum([0.0, *rewards])[: len(obs)],
-        quantiles=quantiles,
-        value=np.average(quantiles, -1, weights_of(config.metric, quantiles.shape[-1])),
+        quantiles=np.sort(actor.policy.quantiles(obs.astype(np.float32))),
         discounted=np.asarray(followed)[: len(obs)] / actor.reward_std,
     )
-
-
-def _pose(env: Any) -> np.ndarray:
-    return env.unwrapped.data.qpos.copy()
 
 
 def frames(
@@ -140,14 +139,6 @@ def side_by_side(columns: list[Iterator[Frame]], hold: int) -> Iterator[Frame]:
     last: list[Frame] = []
     for row in zip_longest(*columns):
         last = [new if new is not None else old for new, old in zip(row, last or row, strict=True)]
-        yield tile(last)
+        yield np.concatenate(last, axis=1)
     for _ in range(hold):
-        yield tile(last)
-
-
-def tile(panels: list[Frame]) -> Frame:
-    """Arrange panels in one row, in a square from four on; its rest is white."""
-    columns = len(panels) if len(panels) < 4 else math.ceil(math.sqrt(len(panels)))
-    panels = [*panels, *[np.full_like(panels[0], 255)] * (-len(panels) % columns)]
-    rows = [np.concatenate(panels[i : i + columns], axis=1) for i in range(0, len(panels), columns)]
-    return np.concatenate(rows)
+        yield np.concatenate(last, axis=1)

@@ -37,8 +37,6 @@ class EvalStep(NamedTuple):
     """False where the episode has ended, in this step or before."""
     terminated: Bool[np.ndarray, " E"]
     """True where the episode ended in this step other than by a time limit."""
-    snapshots: list[Any]
-    """What `snapshot` returned for each env before the step."""
 
 
 def episode_seeds(seed: int, episodes: int) -> np.ndarray:
@@ -77,7 +75,6 @@ def gymnasium_steps(
     envs: Sequence[Any],
     act: Callable[[np.ndarray], np.ndarray],
     seeds: Sequence[int] | np.ndarray,
-    snapshot: Callable[[Any], Any] | None = None,
 ) -> Iterator[EvalStep]:
     """Play one episode per Gymnasium env, with one batched policy call per step.
 
@@ -85,7 +82,6 @@ def gymnasium_steps(
         envs: one env per episode; they stay open.
         act: `act(obs [E, O]) -> action [E, A]`.
         seeds: the seed of each initial state.
-        snapshot: called with each env before each step, for example for its `qpos`.
 
     Yields:
         The steps of all episodes, until the last one has ended.
@@ -95,12 +91,11 @@ def gymnasium_steps(
     alive = np.full(len(envs), True)
     while alive.any():
         before, actions = obs.copy(), act(obs.astype(np.float32))
-        snapshots = [snapshot(env) for env in envs] if snapshot else []
         reward, over = np.zeros(len(envs)), np.full(len(envs), False)
         for i in map(int, np.flatnonzero(alive)):
             obs[i], reward[i], over[i], truncated, _ = envs[i].step(actions[i])
             alive[i] = not (over[i] or truncated)
-        yield EvalStep(before, reward, alive.copy(), over, snapshots)
+        yield EvalStep(before, reward, alive.copy(), over)
 
 
 @lru_cache(maxsize=1)

@@ -154,7 +154,7 @@ def learning_curve(
 
 
 def save_figure(figure: "Figure", path: Path) -> None:
-    """Write a PNG atomically."""
+    """Write a PNG or an SVG, by the suffix, atomically."""
     image = io.BytesIO()
-    figure.savefig(image, format="png")
+    figure.savefig(image, format=path.suffix[1:], metadata={"Date": None})
     files.replace(path, image.getvalue())

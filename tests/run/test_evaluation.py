@@ -92,17 +92,18 @@ def test_evaluation_reports_progress_and_can_be_broken_off():
         assert said[-2:] == [f"{start}{n} of at most 1,000, 2 still running" for n in (0, 50)]
 
 
-def test_gymnasium_steps_yield_what_a_video_needs():
-    envs = [episodes.make_eval_env(SMALL, 5) for _ in range(2)]
+def test_gymnasium_steps_begin_with_the_observation_of_each_env():
+    envs, qpos = [episodes.make_eval_env(SMALL, 5) for _ in range(2)], []
 
-    def qpos(env):
-        return env.unwrapped.data.qpos.copy()
+    def act(obs):
+        qpos.append([env.unwrapped.data.qpos.copy() for env in envs])
+        return np.zeros((2, 3))
 
-    steps = list(episodes.gymnasium_steps(envs, lambda obs: np.zeros((2, 3)), [1, 2], qpos))
+    steps = list(episodes.gymnasium_steps(envs, act, [1, 2]))
     assert [step.alive.all() for step in steps] == [True] * 4 + [False]
     assert not steps[-1].terminated.any()  # cut off by the time limit
-    for step in steps:  # an observation begins with all positions but x
-        np.testing.assert_allclose(step.obs[:, :5], np.stack(step.snapshots)[:, 1:])
+    for step, positions in zip(steps, qpos, strict=True):  # all positions but x come first
+        np.testing.assert_allclose(step.obs[:, :5], np.array(positions)[:, 1:])
 
 
 ABOUT = {"episodes": 6, "env": "Hopper-v4", "engine": "gymnasium"}
