@@ -40,8 +40,10 @@ class PolicyArguments:
         return config
 
     def out_or(self, name: str) -> Path:
-        """Return what to write, by default of that name."""
-        return self.out or files.beside(self.run_dir, name)
+        """Return what to write: by default in the run directory, or beside the policy's file."""
+        source = self.run_dir
+        beside = source.with_name(f"{source.stem}-{name}")
+        return self.out or (beside if source.is_file() else source / name)
 
     @contextlib.contextmanager
     def writing(self, out: Path, config: ResolvedConfig, kind: str = "file") -> Iterator[Any]:

@@ -9,7 +9,7 @@ from typing import Any, Literal, NamedTuple
 import jax
 import numpy as np
 
-from dgae_jax.configs.config import Config, ConfigError, invalid
+from dgae_jax.configs.config import Config, invalid
 from dgae_jax.configs.resolved import ResolvedConfig, resolve
 from dgae_jax.envs.base import Env
 from dgae_jax.envs.registry import custom_env
@@ -138,8 +138,7 @@ def load_policy(
         if name not in (None, config.env):
             raise invalid("env", name, f"left out: {run_dir} is a run of {config.env}")
         if not (type(seed) is int and 0 <= seed < config.num_seeds):
-            allowed = f"an index below num_seeds ({config.num_seeds})"
-            raise ConfigError(f"seed {seed}: must be {allowed}")
+            raise invalid("seed", seed, f"an index below num_seeds ({config.num_seeds})")
         found = checkpoint.load_networks(source, config, which)
         policy, critic = jax.tree.map(lambda x: x[seed], (found.policy, found.critic))
         return Policy(policy, critic, config)

@@ -199,18 +199,14 @@ def load_networks(source: Path, config: ResolvedConfig, which: str) -> Networks:
     """
     if which not in ("latest", "best"):
         raise invalid("checkpoint", which, "one of latest, best")
-    path = source
     if source.is_file():
-        if which != "latest":
-            raise invalid("checkpoint", which, f"latest: {source} is a single one")
-    elif which == "latest":
+        return _load_networks(source, config)
+    if which == "latest":
         return next(networks_in(source, config))
-    else:
-        steps = EvaluationsFile(source / "evaluations.jsonl").best
-        if steps is None:
-            raise invalid("checkpoint", which, f"latest: {source} has no evaluations")
-        path = source / "checkpoints" / file_name(steps)
-    return _load_networks(path, config)
+    steps = EvaluationsFile(source / "evaluations.jsonl").best
+    if steps is None:
+        raise invalid("checkpoint", which, f"latest: {source} has no evaluations")
+    return _load_networks(source / "checkpoints" / file_name(steps), config)
 
 
 def networks_in(run_dir: Path, config: ResolvedConfig) -> Iterator[Networks]:
@@ -222,13 +218,10 @@ def reward_std(path: Path, config: ResolvedConfig) -> np.ndarray:
     """Return what rewards of each seed [S] are divided by; 1 without `normalize_rewards`.
 
     Raises:
-        CheckpointError: the file does not say, as policy files once did not.
+        CheckpointError: as `load`; policy files once did not hold it.
     """
     if not config.normalize_rewards:
         return np.ones(config.num_seeds)
-    if SCALE not in read(path)[1]:
-        hint = "dgae refit fits a critic that does"
-        raise CheckpointError(f"{path}: lacks the scale of rewards; {hint}")
     like = {SCALE: _abstract_state(config).reward_scale.returns.std}
     return np.asarray(load(path, like, config)[SCALE])
 

@@ -18,7 +18,7 @@ from typing import IO, Any
 
 from dgae_jax.configs.config import ConfigError, invalid
 from dgae_jax.configs.resolved import ResolvedConfig, resolve
-from dgae_jax.configs.serial import from_dict, to_dict
+from dgae_jax.configs.serial import flat, from_dict, to_dict
 from dgae_jax.run import files, terminal
 from dgae_jax.run.options import SAVED, RunOptions
 
@@ -149,14 +149,13 @@ def saved_options(run_dir: Path) -> RunOptions:
 
 def environment_changes(run_dir: Path, options: RunOptions) -> list[str]:
     """Return what the bits of a result depend on and is not what it was, with both values."""
-    was, now = last_part(run_dir), _part(options)
-    names = ("device", "cores", "processes", "git_revision")
-    pairs = [(name, was.get(name), now[name]) for name in names]
-    for table in ("settings", "versions"):
-        before = was.get(table, {})
-        pairs += [(name, before.get(name), value) for name, value in now[table].items()]
-    pairs.append(("devices", was.get("options", {}).get("devices"), options.devices))
-    return [f"{name} {new} (was {old})" for name, old, new in pairs if new != old]
+    was, now = flat(last_part(run_dir)), flat(_part(options))
+    same = {"device", "cores", "processes", "git_revision", "options.devices"}
+    same |= {name for name in now if name.startswith(("settings.", "versions."))}
+    pairs = ((name, was.get(name), value) for name, value in now.items() if name in same)
+    return [
+        f"{name.rpartition('.')[2]} {new} (was {old})" for name, old, new in pairs if new != old
+    ]
 
 
 def last_part(run_dir: Path) -> dict[str, Any]:

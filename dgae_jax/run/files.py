@@ -28,11 +28,6 @@ def replace(path: Path, data: bytes) -> None:
         os.close(directory)
 
 
-def beside(source: Path, name: str) -> Path:
-    """Return where to write what is made of a run directory, or of a policy file."""
-    return source.with_name(f"{source.stem}-{name}") if source.is_file() else source / name
-
-
 def write_json(path: Path, data: Any) -> None:
     """Write indented JSON atomically; numbers that are not finite become null."""
     replace(path, (json.dumps(_finite(data), indent=2, allow_nan=False) + "\n").encode())

@@ -27,7 +27,7 @@ from dgae_jax.run.logger import RunLogger
 from dgae_jax.run.metrics import EvaluationsFile
 from dgae_jax.run.options import RunOptions, validate_options
 from dgae_jax.run.runtime import Signals, Stopped, compile_in_thread
-from dgae_jax.run.terminal import Reporter
+from dgae_jax.run.terminal import Reporter, counted
 
 CAPACITY = 64
 """Most iterations in one dispatch."""
@@ -87,7 +87,9 @@ def train(
     ):
         state = None if new else _last_state(run_dir, config)
         with Signals() as signals, _run_errors(config, run_dir, signals):
-            terminal.say(_budget(config))
+            task, size = f"{config.task} {config.algo} on {config.physics}", config.iterations
+            budget = f"{size:,} iterations × {config.samples_per_iteration:,} samples"
+            terminal.say(f"{task}: {budget} × {counted(config.num_seeds, 'seed')}")
             done = 0 if state is None else int(state.iteration[0])
             with RunLogger(run_dir, config, options, done) as logger:
                 if not new:
@@ -195,9 +197,8 @@ def _run_errors(config: ResolvedConfig, run_dir: Path, signals: Signals) -> Iter
 
 def _left(run_dir: Path) -> str:
     """Return from what a run can continue."""
-    with contextlib.suppress(OSError):
-        if saved := checkpoint.checkpoints_in(run_dir / "checkpoints"):
-            return f"continue from {saved[-1].name} with --resume {run_dir}"
+    if saved := checkpoint.checkpoints_in(run_dir / "checkpoints"):
+        return f"continue from {saved[-1].name} with --resume {run_dir}"
     return "there is no checkpoint"
 
 
@@ -250,11 +251,3 @@ def _iterate(
             stopping = signals.anywhere()
             if stopping or last or done % every == 0:
                 logger.save(state)
-
-
-def _budget(config: ResolvedConfig) -> str:
-    runs = f" × {config.num_seeds} seeds" if config.num_seeds > 1 else ""
-    iterations, samples = config.iterations, config.samples_per_iteration
-    used = f"{iterations:,} iterations × {samples:,} samples = {iterations * samples:,}"
-    run = f"{config.task} {config.algo} on {config.physics}"
-    return f"{run}: {used} of {config.total_steps:,} steps{runs}"

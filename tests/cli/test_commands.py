@@ -25,7 +25,7 @@ def test_training_writes_a_run_directory(trained):
 
 def test_the_budget_is_never_exceeded_and_the_last_line_is_the_return(trained):
     run_dir, lines, _ = trained
-    assert lines[0].endswith("15 iterations × 64 samples = 960 of 1,000 steps")
+    assert lines[0].endswith("15 iterations × 64 samples × 1 seed")
     rows = metrics.read(run_dir / "metrics.jsonl")
     assert [row["steps"] for row in rows] == list(range(64, 961, 64))
     result = json.loads((run_dir / "evaluation.json").read_text())
