@@ -3,6 +3,7 @@
 import dataclasses
 import shutil
 import tempfile
+import uuid
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
@@ -17,7 +18,6 @@ from dgae_jax.learn.build import make_greedy, make_quantiles, make_task
 from dgae_jax.learn.types import InferenceState
 from dgae_jax.run import checkpoint, directory, metrics, terminal, training
 from dgae_jax.run.options import RunOptions
-from dgae_jax.run.training import RunError
 
 
 class Policy:
@@ -94,20 +94,15 @@ def train(
         RunError: the run ends early, by a signal too. The message says how to continue, from a
             directory that stays, even a temporary one.
     """
-    path = Path(run_dir or tempfile.mkdtemp(prefix="dgae_jax-"))
-    directory = None if run_dir is None else path
-    try:
-        with terminal.silenced(quiet), custom_env(env) as name:
-            config = config if name is None else dataclasses.replace(config, env=name)
-            evaluation, _ = training.train(resolve(config), RunOptions(run_dir=path, **options))
-            policy, rows = load_policy(path, env=env), metrics.read(path / "metrics.jsonl")
-            return Run(policy, rows, evaluation, directory)
-    except RunError:
-        directory = path  # a run can continue there
-        raise
-    finally:
-        if directory is None:
-            shutil.rmtree(path, ignore_errors=True)
+    temporary = Path(tempfile.gettempdir()) / f"dgae_jax-{uuid.uuid4().hex}"
+    path = Path(run_dir or temporary)
+    with terminal.silenced(quiet), custom_env(env) as name:
+        config = config if name is None else dataclasses.replace(config, env=name)
+        evaluation, _ = training.train(resolve(config), RunOptions(run_dir=path, **options))
+        policy, rows = load_policy(path, env=env), metrics.read(path / "metrics.jsonl")
+    if not run_dir:
+        shutil.rmtree(temporary)
+    return Run(policy, rows, evaluation, path if run_dir else None)
 
 
 def load_policy(

@@ -106,9 +106,8 @@ def hold(file: IO, in_use: ConfigError) -> None:
 def config_of(source: Path) -> ResolvedConfig:
     """Return the configuration of a run directory or policy file; raise ConfigError for others."""
     with _must_be("a run directory or a policy file", source):
-        is_file = source.is_file()
-    if not is_file:
-        return read_config(source)
+        if not source.is_file():
+            return read_config(source)
     from dgae_jax.run import checkpoint
 
     return checkpoint.read(source)[0]

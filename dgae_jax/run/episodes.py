@@ -105,8 +105,7 @@ def _programs(config: ResolvedConfig, custom: Any) -> tuple[Any, Any, Trainer]:
     greedy = make_greedy(env, config)
 
     def advance(policy: InferenceState, episodes: tuple, count: int) -> tuple:
-        """Take `count` steps from env states, returns so far and whether each still runs [E]."""
-
+        # of env states, returns so far, and True where an episode still runs
         def one(_, episodes: tuple) -> tuple:
             state, total, alive = episodes
             state = jax.vmap(env.step)(state, greedy(policy, state.obs))
