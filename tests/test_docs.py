@@ -23,7 +23,7 @@ from dgae_jax.configs.config import ConfigError
 from dgae_jax.configs.serial import SCHEMA, to_dict
 from dgae_jax.learn.build import TABLES
 from dgae_jax.maths.risk import METRICS
-from dgae_jax.report import markdown, results
+from dgae_jax.report import results, tables
 from dgae_jax.report.groups import groups_of
 from dgae_jax.run import directory, metrics
 from dgae_jax.run.training import train_command
@@ -107,7 +107,7 @@ def test_report_tables_equal_the_results(study, tmp_path):
         if mine or (study == "tuned" and path.name == "README.md"):
             copy = tmp_path / path.name
             copy.write_text(text)
-            markdown.replace(copy, groups, study)
+            tables.replace(copy, groups, study)
             assert copy.read_text() == text
 
 

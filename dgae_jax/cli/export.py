@@ -10,7 +10,7 @@ from dgae_jax.cli import parse
 from dgae_jax.cli.evaluate import PolicyArguments, titles
 from dgae_jax.configs.config import ConfigError, invalid
 from dgae_jax.envs.registry import TASKS, spec_of
-from dgae_jax.export import encoding, gl
+from dgae_jax.export import gl
 from dgae_jax.run import terminal
 
 
@@ -86,7 +86,7 @@ def render(args: RenderArguments) -> None:
     for path, config in zip(sources, configs, strict=True):
         if not spec_of(config.env).eval_envs:
             raise ConfigError(f"{path}: must be a run of {', '.join(TASKS)}, not {config.env}")
-    formats = encoding.FORMATS[args.format]
+    formats = ("mp4", "gif") if args.format == "both" else (args.format,)
     gl.choose()
     file = args.stem.with_name(f"{args.stem.name}.{formats[0]}")
     with args.writing(file, configs[0]) as watch:
@@ -98,7 +98,7 @@ def render(args: RenderArguments) -> None:
         seeds = episode_seeds(args.seed, args.episodes)
         size = args.width // 2 * 2, args.height // 2 * 2
         frames = video.frames(actors, seeds, args.seconds, size, args.fps, watch)
-        written = encoding.write(frames, args.stem, formats, args.fps)
+        written = video.write(frames, args.stem, formats, args.fps)
     for path in written:
         terminal.say(f"written to {path} ({path.stat().st_size / 1e6:.1f} MB)")
 

@@ -42,11 +42,11 @@ def report(args: Arguments) -> None:
     sweeps = [results.read(path) for path in args.sweeps]
     out = args.out or sweeps[0].directory / "report"
     published = results.published() if args.published else []
-    from dgae_jax.report import groups, markdown, page
+    from dgae_jax.report import groups, page, tables
 
     if args.markdown:
-        tables = groups.groups_of(sweeps[0].rows)
-        names = markdown.replace(args.markdown, tables, sweeps[0].name)
+        found = groups.groups_of(sweeps[0].rows)
+        names = tables.replace(args.markdown, found, sweeps[0].name)
         terminal.say(f"written {args.markdown}: {', '.join(names)}")
     for sweep in sweeps if args.videos else ():
         _write_videos(sweep)

@@ -42,11 +42,7 @@ def choose() -> str:
 
 @functools.cache
 def works(backend: str) -> bool:
-    """Return whether MuJoCo can draw with this backend, within a minute."""
+    """Return whether MuJoCo can draw with this backend."""
     environment = {**os.environ, VARIABLE: backend}
     command = [sys.executable, "-c", _TRIAL]
-    try:
-        subprocess.run(command, env=environment, capture_output=True, timeout=60, check=True)
-    except subprocess.SubprocessError:
-        return False
-    return True
+    return subprocess.run(command, env=environment, capture_output=True).returncode == 0

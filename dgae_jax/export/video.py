@@ -1,8 +1,10 @@
 """Videos of trained policies: robots side by side, each over an overlay of its critic."""
 
 import math
+import subprocess
+import tempfile
 from collections.abc import Iterable, Iterator, Sequence
-from itertools import islice, zip_longest
+from itertools import chain, islice, zip_longest
 from pathlib import Path
 from typing import NamedTuple
 
@@ -15,13 +17,19 @@ from dgae_jax.configs.resolved import ResolvedConfig
 from dgae_jax.export.overlay import Episode, Overlay
 from dgae_jax.export.renderer import Renderer
 from dgae_jax.maths.returns import lambda_sum
-from dgae_jax.run import checkpoint
+from dgae_jax.run import checkpoint, files
 from dgae_jax.run.api import Policy
 from dgae_jax.run.calibration import MAX_RETURN_STEPS, steps_that_count
 from dgae_jax.run.episodes import gymnasium_steps, make_eval_env
 from dgae_jax.run.runtime import Watch, unwatched
 
 Frame = UInt8[np.ndarray, "H W 3"]
+
+GIF_FILTER = (
+    "fps={rate},scale='min(640,iw)':-1:flags=lanczos,split[a][b];"
+    "[a]palettegen=max_colors=64[p];[b][p]paletteuse=dither=none"
+)
+"""At most 640 pixels wide, without dithering: then what stands still costs nothing."""
 
 
 class Actor(NamedTuple):
@@ -142,3 +150,42 @@ def side_by_side(columns: list[Iterator[Frame]], hold: int) -> Iterator[Frame]:
         yield np.concatenate(last, axis=1)
     for _ in range(hold):
         yield np.concatenate(last, axis=1)
+
+
+def write(frames: Iterator[Frame], stem: Path, formats: tuple[str, ...], fps: int) -> list[Path]:
+    """Write a video, each file complete or not at all.
+
+    Args:
+        frames: of even height and width.
+        stem: the files' path without its suffix.
+        formats: any of mp4, gif.
+        fps: frames per second; a GIF has at most 12.5.
+
+    Returns:
+        The paths written.
+
+    Raises:
+        OSError: a file cannot be written.
+    """
+    import imageio_ffmpeg
+
+    first = next(frames)
+    height, width, _ = first.shape
+    options = {
+        "mp4": ["-c:v", "libx264", "-pix_fmt", "yuv420p"],
+        "gif": ["-vf", GIF_FILTER.format(rate=fps / math.ceil(fps / 12.5))],
+    }
+    paths = [stem.with_name(f"{stem.name}.{kind}") for kind in formats]
+    # not imageio_ffmpeg.write_frames, which forks: JAX warns of that
+    command = [imageio_ffmpeg.get_ffmpeg_exe(), "-loglevel", "error", "-f", "rawvideo"]
+    command += ["-pix_fmt", "rgb24", "-s", f"{width}x{height}", "-r", str(fps), "-i", "-"]
+    with tempfile.TemporaryDirectory() as directory:
+        parts = [Path(directory) / f"video.{kind}" for kind in formats]
+        for kind, part in zip(formats, parts, strict=True):
+            command += [*options[kind], str(part)]
+        with subprocess.Popen(command, stdin=subprocess.PIPE) as ffmpeg:
+            for frame in chain([first], frames):
+                ffmpeg.stdin.write(frame.tobytes())  # pyright: ignore[reportOptionalMemberAccess]
+        for part, path in zip(parts, paths, strict=True):
+            files.replace(path, part.read_bytes())
+    return paths

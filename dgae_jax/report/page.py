@@ -1,7 +1,6 @@
 """The files of a report: its figures, and one page of HTML from `templates/page.html`."""
 
 import base64
-from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 
@@ -11,7 +10,7 @@ from matplotlib.figure import Figure
 from dgae_jax.report import analysis, figures, tables
 from dgae_jax.report.groups import Group, by_task, groups_of, shown
 from dgae_jax.report.results import Published, Row, Sweep
-from dgae_jax.report.tables import NONE, Table
+from dgae_jax.report.tables import Table
 from dgae_jax.run import files
 from dgae_jax.run.terminal import counted
 
@@ -98,18 +97,13 @@ def _settings(groups: list[Group]) -> list[tuple[Group, Group, Table, set[str]]]
 
 
 def _versions(rows: Iterable[Row]) -> Table:
-    """Count the runs of each version, machine and revision."""
-    facts = Counter(
-        (name, NONE if value is None else str(value))
+    """Return the revisions, versions and machines of all runs."""
+    facts = {
+        (name, shown(value))
         for row in rows
-        for name, value in {
-            "git revision": row.git_revision,
-            **{f"machine: {name}": value for name, value in row.machine.items()},
-            **row.versions,
-        }.items()
-    )
-    counts = [(*fact, str(count)) for fact, count in sorted(facts.items())]
-    return Table(("name", "value", "runs"), counts)
+        for name, value in {"git revision": row.git_revision, **row.versions, **row.machine}.items()
+    }
+    return Table(("name", "value"), sorted(facts), keys=1)
 
 
 def _svg_uri(figure: Figure) -> str:

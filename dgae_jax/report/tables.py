@@ -1,15 +1,23 @@
-"""Tables of a report, as data and as Markdown."""
+"""Tables of a report: as data, as Markdown, and inside Markdown documents.
 
-from collections.abc import Iterable, Sequence
+A table of a document stands between `<!-- dgae report: NAME -->` and `<!-- /dgae report -->`.
+`NAME of SWEEP` names the directory of a sweep; a report on another sweep leaves that table alone.
+"""
+
+import re
+from collections.abc import Callable, Iterable, Sequence
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
+from dgae_jax.configs.config import invalid
 from dgae_jax.maths.statistics import iqm
 from dgae_jax.report import analysis
 from dgae_jax.report.analysis import Estimate
 from dgae_jax.report.groups import Group, by_task, order
 from dgae_jax.report.results import Published
+from dgae_jax.run import files
 
 NONE = "–"
 IQM = "IQM [95 %]"
@@ -40,7 +48,9 @@ def returns(groups: Iterable[Group]) -> Table:
     for group in groups:
         best = [row.best for row in group.rows if row.best is not None]
         seeds = " · ".join(number(value) for value in group.finals)
-        rows.append((*_key(group), *_scores(group.finals), spread(best) if best else NONE, seeds))
+        scores = spread(group.finals), between(analysis.interquartile_mean(group.finals))
+        size = str(len(group.rows))
+        rows.append((group.task, group.name, size, *scores, spread(best) if best else NONE, seeds))
     names = ("task", "algorithm", "seeds", "mean ± std", IQM, "best checkpoint", "each seed")
     return Table(names, rows)
 
@@ -60,13 +70,6 @@ def attribution_over_tasks(groups: Iterable[Group]) -> Table:
         rows.append((name, str(len(pairs)), str(seeds), *shares))
     above = [f"above the first {when} [95 %]" for when in ("at the end", "over the run")]
     return Table(("variant", "tasks", "seeds", *above), rows, keys=1)
-
-
-def risk(groups: Iterable[Group]) -> Table:
-    """Final returns: the mean over episodes, and the mean of their worst quarter (CVaR)."""
-    rows = [(*_key(group), *_scores(group.finals), *_scores(group.worst)) for group in groups]
-    header = ("task", "variant", "seeds", "mean ± std", IQM, "worst quarter ± std", IQM)
-    return Table(header, rows)
 
 
 def reach(groups: Iterable[Group]) -> Table:
@@ -132,14 +135,6 @@ def comparison(first: Iterable[Group], second: Iterable[Group], names: tuple[str
     return Table(("task", "algorithm", *columns, "difference [95 %]"), rows)
 
 
-def _key(group: Group) -> tuple[str, str, str]:
-    return group.task, group.name, str(len(group.rows))
-
-
-def _scores(scores: np.ndarray) -> tuple[str, str]:
-    return spread(scores), between(analysis.interquartile_mean(scores))
-
-
 def number(value: float, form: str = "{:,.0f}") -> str:
     """Format a number, with a true minus sign."""
     return form.format(value).replace("-", "−")
@@ -165,3 +160,45 @@ def markdown(table: Table) -> str:
     return "\n".join(
         "| " + " | ".join(text.replace("|", "\\|") for text in line) + " |" for line in lines
     )
+
+
+TABLES: dict[str, Callable[[Sequence[Group]], Table]] = {
+    "iqm": interquartile_means,
+    "returns": returns,
+    "improvement": lambda groups: improvement(analysis.improvements(groups)),
+    "attribution-over-tasks": attribution_over_tasks,
+    "reach": reach,
+    "speed": speed,
+}
+
+_MARKER = re.compile(r"^<!-- /?dgae report.*-->$", re.MULTILINE)
+_BLOCK = re.compile(
+    r"(?<=^<!-- dgae report: )(?P<name>.*?)(?: of (?P<sweep>.*?))? -->\n"
+    r"(?P<table>.*?)(?=^<!-- /dgae report -->$)",
+    re.MULTILINE | re.DOTALL,
+)
+
+
+def replace(path: Path, groups: Sequence[Group], sweep: str) -> list[str]:
+    """Replace the tables of a document that are of a sweep, and return their names.
+
+    Raises:
+        ConfigError: the file cannot be read or written, markers do not match, or no table is of
+            the sweep.
+    """
+    try:
+        text = path.read_bytes().decode()
+        blocks = list(_BLOCK.finditer(text))
+        known = [block for block in blocks if block["name"] in TABLES]
+        mine = [block for block in known if block["sweep"] in (None, sweep)]
+        if not mine or len(_MARKER.findall(text)) != 2 * len(known):
+            markers = "<!-- dgae report: NAME --> and <!-- /dgae report -->"
+            allowed = f"a file with tables of {sweep} between lines {markers}"
+            raise invalid("markdown", path, f"{allowed}; NAME is one of {', '.join(TABLES)}")
+        for block in reversed(mine):
+            table = markdown(TABLES[block["name"]](groups))
+            text = f"{text[: block.start('table')]}{table}\n{text[block.end('table') :]}"
+        files.replace(path, text.encode())
+    except (OSError, UnicodeDecodeError) as reason:
+        raise invalid("markdown", path, f"a file that can be read and written ({reason})") from None
+    return [block["name"] for block in mine]

@@ -16,7 +16,7 @@ from numpy.testing import assert_allclose
 
 import dgae_jax as dg
 from dgae_jax.configs.config import ConfigError
-from dgae_jax.export import arrays, bundle
+from dgae_jax.export import bundle
 from dgae_jax.export.templates.policy import Policy
 from dgae_jax.run import checkpoint
 from dgae_jax.run.directory import read_config
@@ -96,7 +96,7 @@ def test_custom_networks_are_refused(trained):
     found = checkpoint.load_networks(trained, config, "latest")
     renamed = found.policy._replace(params={"params": {"Body": found.policy.params["params"]}})
     with pytest.raises(ConfigError, match="'kernel'"):
-        arrays.arrays_of(found._replace(policy=renamed), config, 0)
+        bundle.arrays_of(found._replace(policy=renamed), config, 0)
 
 
 @pytest.fixture(scope="module")
@@ -137,7 +137,7 @@ def test_facts_of_a_policy_file_come_from_its_sweep(tmp_path):
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 
     def card(config=made.config):
-        values = arrays.arrays_of(made.networks, config, 0)
+        values = bundle.arrays_of(made.networks, config, 0)
         facts = bundle.facts_of(made.file, made.file, config, 0) | {"best": False}
         return bundle.model_card("npz", values, config, 0, facts)
 

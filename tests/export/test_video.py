@@ -13,7 +13,7 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 from PIL import Image, ImageSequence
 
-from dgae_jax.export import encoding, overlay
+from dgae_jax.export import overlay, video
 from dgae_jax.export.overlay import Episode, Overlay
 from dgae_jax.export.video import Actor, play, side_by_side, states_shown
 from tests.export.conftest import make_untrained
@@ -114,7 +114,7 @@ def test_files_have_the_frames_and_the_speed_given(tmp_path):
     picture, fps = np.zeros((48, 64, 3), np.uint8), 10
     picture[:, :32] = (0, 114, 178)
     pictures = [np.roll(picture, 4 * i, axis=1) for i in range(10)]
-    paths = encoding.write(iter(pictures), tmp_path / "a.b", ("mp4", "gif"), fps)
+    paths = video.write(iter(pictures), tmp_path / "a.b", ("mp4", "gif"), fps)
     assert paths == [tmp_path / "a.b.mp4", tmp_path / "a.b.gif"]
     frames, speed = read_video(paths[0])
     assert (frames.shape, speed) == ((10, 48, 64, 3), fps)

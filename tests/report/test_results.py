@@ -24,7 +24,7 @@ def test_row_is_what_the_file_says(tmp_path):
     written = row("hopper", "ppo", 3, curve=curve, final=final, seconds=9.5)
     read, other = results.read(study(tmp_path, [written, row(best=None)])).rows
     assert (read.run, read.task, read.algo, read.seed) == ("hopper-ppo-3", "hopper-v4", "ppo", 3)
-    assert (read.seconds, read.final, read.returns.tolist()) == (9.5, 7.0, [9, 5])
+    assert (read.seconds, read.final) == (9.5, 7.0)
     np.testing.assert_array_equal(read.curve_steps, [5, 10])
     np.testing.assert_array_equal(read.curve_returns, [np.nan, 2.5])
     assert (read.best, other.best) == (written["best"]["return_mean"], None)

@@ -3,7 +3,7 @@
 import pytest
 
 from dgae_jax.configs.config import ConfigError
-from dgae_jax.report import markdown, tables
+from dgae_jax.report import tables
 from tests.report.rows import plain, row
 
 
@@ -54,15 +54,6 @@ def test_over_tasks_the_wins_of_a_variant_are_averaged(grouped):
     ]
 
 
-def test_risk_is_the_mean_of_the_worst_quarter_of_the_episodes(grouped):
-    final = {"engine": "native", "return_mean": 7.75}
-    eight, one = final | {"returns": [11, 3, 9, 10, 5, 8, 7, 9]}, final | {"returns": [8]}
-    rows = [row(seed=0, final=eight), row(seed=1, final=one)]
-    assert tables.risk(grouped(rows)).rows == [
-        ("hopper-v4", "DPPO", "2", "8 ± 0", "8 [8, 8]", "6 ± 3", "6 [4, 8]")
-    ]
-
-
 def block(name, inside=""):
     return f"<!-- dgae report: {name} -->\n{inside}<!-- /dgae report -->\n"
 
@@ -73,11 +64,11 @@ def test_tables_of_a_document_are_replaced_and_the_rest_stays(grouped, tmp_path)
     returns, speed = (tables.markdown(t(groups)) + "\n" for t in (tables.returns, tables.speed))
     assert "| --- | --- | ---: |" in returns
     for _ in range(2):
-        assert markdown.replace(path, groups, "sweep") == ["returns", "speed"]
+        assert tables.replace(path, groups, "sweep") == ["returns", "speed"]
         new = f"# Title\n{block('returns', returns)}between\n{block('speed', speed)}end\n"
         assert path.read_text() == new
     path.write_text(block("returns of short") + block("speed of long"))
-    assert markdown.replace(path, groups, "long") == ["speed"]
+    assert tables.replace(path, groups, "long") == ["speed"]
     assert path.read_text() == block("returns of short") + block("speed of long", speed)
 
 
@@ -98,6 +89,6 @@ def test_document_without_a_table_to_replace_is_refused(text, sentence, grouped,
     path = tmp_path / "doc.md"
     path.write_bytes(text.encode("latin-1"))
     with pytest.raises(ConfigError) as caught:
-        markdown.replace(path, grouped([row()]), "sweep")
+        tables.replace(path, grouped([row()]), "sweep")
     assert str(caught.value).startswith(f"markdown {path}: must be a file ")
     assert sentence in str(caught.value)
