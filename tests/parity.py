@@ -40,7 +40,7 @@ def model_of(name):
 
 
 def reads_of(name):
-    return Reads(("torso",) if name == "ant" else (), forces=True)
+    return Reads(xpos=name == "ant", cfrc_ext=True)
 
 
 @functools.cache

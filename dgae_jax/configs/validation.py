@@ -152,8 +152,8 @@ def _check_task(config: Config, spec: EnvSpec) -> None:
             require(str(config.physics))
     except ValueError as reason:
         raise ConfigError(str(reason), "physics") from None
-    if spec.versions:
-        lookup("env_version", config.env_version, dict.fromkeys(spec.versions))
+    if spec.eval_envs:
+        lookup("env_version", config.env_version, spec.eval_envs)
     else:
         only = f"unset with {config.env}"
         _require(config, "env_version", lambda version: False, only)

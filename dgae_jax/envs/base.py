@@ -6,11 +6,10 @@ is not installed, which the engine suppresses.
 
 import dgae_jax.physics.mjx  # noqa: F401, I001
 import brax.envs
-import jax
 from brax.envs.base import Env, State, Wrapper
 from jaxtyping import Array, Float
 
-__all__ = ["Env", "State", "ThirdPartyEnv", "Wrapper", "brax", "has_limit", "restart"]
+__all__ = ["Env", "State", "ThirdPartyEnv", "Wrapper", "brax", "restart"]
 
 
 class ThirdPartyEnv(Env):
@@ -30,8 +29,3 @@ def restart(env: Env, state: State, rng: Array, done: Array) -> State:
     """
     own = getattr(type(env), "restart", None)  # of the class: a wrapper passes on attributes
     return env.reset(rng) if own is None else own(env, state, rng, done)
-
-
-def has_limit(env: Env) -> bool:
-    """Return True if the task marks truncations of its own, in `info["truncation"]`."""
-    return "truncation" in jax.eval_shape(env.reset, jax.random.key(0)).info

@@ -34,7 +34,8 @@ def trainers() -> Iterator[None]:
 def _replicated(tree: Any, devices: Sequence[Any]) -> Any:
     """Return a copy on each device, along a new first axis."""
     sharding = NamedSharding(Mesh(np.array(devices), ("devices",)), PartitionSpec("devices"))
-    return jax.tree.map(lambda x: jax.device_put(jnp.stack([x] * len(devices)), sharding), tree)
+    copies = jax.tree.map(lambda x: jnp.stack([x] * len(devices)), tree)
+    return jax.device_put(copies, sharding)
 
 
 for _name in TASKS:

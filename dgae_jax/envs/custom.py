@@ -3,12 +3,12 @@
 import warnings
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from dgae_jax.envs.base import Env, State, Wrapper, brax, restart
-from dgae_jax.envs.env_checker import check_env
-from dgae_jax.physics.native import silence_warnings
+from dgae_jax.envs.base import Env, Wrapper, brax
+from dgae_jax.envs.registry import CUSTOM_ENVS
 
 
 class CustomTask(Wrapper):
@@ -21,31 +21,34 @@ class CustomTask(Wrapper):
         low, high = (jnp.broadcast_to(jnp.asarray(each, float), self.action_size) for each in own)
         return low, high
 
-    def restart(self, state: State, rng: Array, done: Array) -> State:
-        """Restart as `envs.base.restart`."""
-        return restart(self.env, state, rng, done)
-
 
 def with_range(env: Env) -> Env:
     """Return the env, with a range of its actions if it has none."""
     return env if hasattr(env, "action_range") else CustomTask(env)
 
 
-def make_custom(env: Any) -> CustomTask:
-    """Check and wrap an env; raise ValueError if the trainer cannot take it."""
+def make_custom(name: str, physics: str) -> CustomTask:
+    """Wrap the env that was registered as `custom:NAME`.
+
+    Raises:
+        ValueError: if the trainer cannot take it.
+    """
+    env = CUSTOM_ENVS[f"custom:{name}"]
     if not isinstance(env, Env):
-        raise ValueError(f"{type(env).__name__} is not a brax.envs.base.Env")
-    check_env(env)
+        raise ValueError(f"{name} is not a brax.envs.base.Env")
+    state: Any = jax.eval_shape(env.reset, jax.random.key(0))
+    for part, shape in (("obs", (env.observation_size,)), ("reward", ()), ("done", ())):
+        value = getattr(state, part)
+        if getattr(value, "shape", None) != shape:
+            raise ValueError(f"{part} of {name} is {value}, and must be an array of shape {shape}")
     return CustomTask(env)
 
 
 def make_brax(name: str, physics: str, **parameters) -> Env:
     """Build one of Brax's own environments on its MJX backend, with actions in [−1, 1]."""
     try:
-        with warnings.catch_warnings(), silence_warnings():
+        with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # of features of the model files that Brax leaves out
             return CustomTask(brax.envs.get_environment(name, backend=physics, **parameters))
-    except (ValueError, TypeError) as reason:
-        raise ValueError(
-            f"environment brax:{name}: must be one that Brax can build on {physics} ({reason})"
-        ) from None
+    except (KeyError, ValueError, TypeError) as reason:
+        raise ValueError(f"Brax cannot build {name} on {physics}: {reason!r}") from None

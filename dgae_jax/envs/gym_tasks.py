@@ -12,8 +12,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from dgae_jax.envs.task import HealthyTask, Task
+from dgae_jax.envs.task import HealthyTask, Task, load_spec
 from dgae_jax.physics.engine import PhysicsState, Reads
+from dgae_jax.physics.registry import make_physics
 
 Range = tuple[float, float]
 
@@ -83,12 +84,11 @@ class Ant(HealthyTask):
     """Observe contact forces in v5."""
 
     NAME, FILE, FRAME_SKIP, AXES = "Ant", {"v4": "ant.xml", "v5": "ant.xml"}, 5, 2
-    TERMS = (*HealthyTask.TERMS, "reward_contact")
 
     @staticmethod
     def reads(version: str, use_contact_forces: bool = False, **parameters) -> Reads:
         """Read the torso's position; contact forces always in v5, if asked for in v4."""
-        return Reads(bodies=("torso",), forces=version == "v5" or use_contact_forces)
+        return Reads(xpos=True, cfrc_ext=version == "v5" or use_contact_forces)
 
     def _position(self, state: PhysicsState) -> Float[Array, "2"]:
         return state.xpos[0, :2]
@@ -120,3 +120,10 @@ class Ant(HealthyTask):
 GYM_TASKS: dict[str, type[Task]] = {
     task.NAME.lower(): task for task in (Ant, Hopper, Swimmer, Walker2d)
 }
+
+
+def make_gym_task(name: str, physics: str, version: str, **parameters) -> Task:
+    """Build a task over the engine named `physics`."""
+    task = GYM_TASKS[name]
+    spec, reads = load_spec(task.FILE[version]), task.reads(version, **parameters)
+    return task(make_physics(physics, spec, task.FRAME_SKIP, reads), version, **parameters)

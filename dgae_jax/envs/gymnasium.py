@@ -18,6 +18,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from gymnasium.spaces import Box
+from gymnasium.wrappers import TransformAction
 from jaxtyping import Array, Bool, Float, Int, UInt32
 
 from dgae_jax.envs.base import State, ThirdPartyEnv
@@ -32,15 +33,6 @@ class Position(NamedTuple):
 
     seed: UInt32[Array, " 2"]
     steps: Int[Array, ""]
-
-
-class ClipAction(gymnasium.ActionWrapper):
-    """Cast and clip actions to the env's own range; its bounds may be rounded outwards."""
-
-    def action(self, action: np.ndarray) -> np.ndarray:
-        """Return the action as the env takes it."""
-        space: Any = self.action_space
-        return np.clip(action.astype(space.dtype), space.low, space.high)
 
 
 def make_gym_env(name: str, **parameters) -> gymnasium.Env:
@@ -61,7 +53,12 @@ def make_gym_env(name: str, **parameters) -> gymnasium.Env:
         if not vector or (kind == "actions" and np.dtype(space.dtype).kind != "f"):
             env.close()
             raise ValueError(f"its {kind} are {space}, and must be a Box with one axis of floats")
-    return ClipAction(env)
+    space: Any = env.action_space  # its bounds may have been rounded outwards
+
+    def clip(action: np.ndarray) -> np.ndarray:
+        return np.clip(action.astype(space.dtype), space.low, space.high)
+
+    return TransformAction(env, clip, space)
 
 
 class _Envs:
@@ -113,9 +110,8 @@ def _to_int64(seeds: np.ndarray) -> list[int]:
 class GymnasiumTask(ThirdPartyEnv):
     """A task of Gymnasium; `done` includes its own truncations, marked in `info["truncation"]`."""
 
-    backend = "gymnasium"
-
-    def __init__(self, name: str, **parameters):
+    def __init__(self, name: str, physics: str, **parameters):
+        self.backend = physics
         first = make_gym_env(name, **parameters)
         observations: Any = first.observation_space
         actions: Any = first.action_space
@@ -125,8 +121,10 @@ class GymnasiumTask(ThirdPartyEnv):
         # numbered by the order in which a process makes its tasks, so a cached program finds them
         number = next(_count)
         self._reset, self._step = (f"dgae_jax_gymnasium_{number}_{f}" for f in ("reset", "step"))
-        ffi.register(self._reset, _weak(self._envs, _Envs.reset))
-        ffi.register(self._step, _weak(self._envs, _Envs.step))
+        # weakly: XLA keeps what it may call for ever, but not the envs of a task that is gone
+        reset, step = (weakref.WeakMethod(f) for f in (self._envs.reset, self._envs.step))
+        ffi.register(self._reset, lambda before, after: reset()(before, after))  # pyright: ignore
+        ffi.register(self._step, lambda before, after: step()(before, after))  # pyright: ignore
 
     def reset(self, rng: Array) -> State:
         """Begin an episode with a seed drawn from `rng`."""
@@ -163,9 +161,3 @@ def _call(name: str, like: tuple[Any, ...], *arguments: Array) -> Any:
     shapes = tuple(jax.ShapeDtypeStruct(x.shape, x.dtype) for x in like)
     call = jax.ffi.ffi_call(name, shapes, vmap_method="broadcast_all", has_side_effect=True)
     return call(*arguments)
-
-
-def _weak(envs: _Envs, method: Callable) -> ffi.Function:
-    """Bind weakly: XLA keeps what it may call for ever, but not the envs of a task that is gone."""
-    reference = weakref.ref(envs)
-    return lambda before, after: method(reference(), before, after)

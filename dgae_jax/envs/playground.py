@@ -11,7 +11,6 @@ from brax.envs.wrappers.training import EpisodeWrapper
 from jaxtyping import Array, Float
 
 from dgae_jax.envs.base import Env, State, ThirdPartyEnv
-from dgae_jax.physics.native import silence_warnings
 from dgae_jax.physics.registry import require
 
 
@@ -52,7 +51,7 @@ def _state(inner: Any) -> State:
 def make_playground(name: str, physics: str, **parameters) -> Env:
     """Build a task of Playground, if possible; `parameters` override its configuration."""
     require(physics)
-    with warnings.catch_warnings(), silence_warnings():
+    with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         from mujoco_playground import dm_control_suite, registry  # pyright: ignore
         from mujoco_playground._src.mjx_env import MENAGERIE_PATH  # pyright: ignore

@@ -3,22 +3,16 @@
 Importing this loads no task: names are checked before JAX, MuJoCo and Brax are imported.
 """
 
-import sys
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from importlib.util import find_spec
+from pkgutil import resolve_name
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from dgae_jax.physics.registry import ENGINES
 
 if TYPE_CHECKING:
     from dgae_jax.envs.base import Env
-
-BRAX_NAMES = (
-    "ant", "fast", "halfcheetah", "hopper", "humanoid", "humanoidstandup", "inverted_pendulum",
-    "inverted_double_pendulum", "pusher", "reacher", "walker2d",
-)  # fmt: skip
-"""Brax's own environments that it builds on its MJX backend; its swimmer is not one of them."""
 
 CUSTOM_ENVS: dict[str, Any] = {}
 """Envs that were given as objects, by their names with the prefix `custom:`."""
@@ -27,6 +21,8 @@ CUSTOM_ENVS: dict[str, Any] = {}
 class EnvSpec(NamedTuple):
     """A task that can be built and evaluated."""
 
+    builder: str
+    """Where the function or class is that builds it."""
     engines: tuple[str, ...]
     """Engines that the task runs on; the first is the default."""
     eval_envs: Mapping[str, str] = {}
@@ -44,20 +40,27 @@ class EnvSpec(NamedTuple):
         """The version where none is named; None for a task without versions."""
         return next(iter(self.eval_envs), None)
 
-    @property
-    def versions(self) -> tuple[str, ...]:
-        """Gymnasium's versions of the task; empty where it has none."""
-        return tuple(self.eval_envs)
-
     def eval_env(self, version: str | None = None) -> str | None:
         """Return Gymnasium's id of the evaluation env; None if the task evaluates itself."""
-        return self.eval_envs[version or self.versions[0]] if self.versions else self.gymnasium_id
+        return self.eval_envs.get(version or str(self.default_version), self.gymnasium_id)
 
 
 TASKS = {
-    name.lower(): EnvSpec(tuple(ENGINES), {v: f"{name}-{v}" for v in ("v4", "v5")})
+    name.lower(): EnvSpec(
+        "dgae_jax.envs.gym_tasks:make_gym_task",
+        tuple(ENGINES),
+        {version: f"{name}-{version}" for version in ("v4", "v5")},
+    )
     for name in ("Ant", "Hopper", "Swimmer", "Walker2d")
 }
+
+_THIRD_PARTY = {
+    "brax": EnvSpec("dgae_jax.envs.custom:make_brax", ("mjx",)),
+    "playground": EnvSpec("dgae_jax.envs.playground:make_playground", ("mjx", "mjx-warp")),
+    "gymnasium": EnvSpec("dgae_jax.envs.gymnasium:GymnasiumTask", ("gymnasium",)),
+    "custom": EnvSpec("dgae_jax.envs.custom:make_custom", ("custom",)),
+}
+"""Third-party tasks by the prefix of their names."""
 
 NAMES = f"one of {', '.join(TASKS)}, or brax:NAME, playground:NAME or gymnasium:ID"
 """The names that a task may have, for messages."""
@@ -97,26 +100,15 @@ def spec_of(name: str) -> EnvSpec:
     if name in TASKS:
         return TASKS[name]
     kind, _, own_name = name.partition(":")
-    if not own_name or kind not in ("brax", "playground", "gymnasium", "custom"):
+    if not own_name or kind not in _THIRD_PARTY:
         raise ValueError(NAMES)
-    if kind == "gymnasium":
-        return EnvSpec(("gymnasium",), gymnasium_id=own_name)
-    if kind == "brax" and own_name not in (known := _brax_names()):
-        raise ValueError(f"brax:NAME with NAME one of {', '.join(sorted(known))}")
     if kind == "playground" and find_spec("mujoco_playground") is None:
         install = 'pip install "dgae_jax[playground]"'
         raise ValueError(f"used with the package playground, which is not installed: {install}")
     if kind == "custom" and name not in CUSTOM_ENVS:
         calls = "dgae_jax.train(config, run_dir, env=…), load_policy(run_dir, env=…)"
         raise ValueError(f"given as an object from Python: {calls}")
-    engines = {"brax": ("mjx",), "playground": ("mjx", "mjx-warp"), "custom": ("custom",)}
-    return EnvSpec(engines[kind])
-
-
-def _brax_names() -> set[str]:
-    brax: Any = sys.modules.get("brax.envs")
-    registered = () if brax is None else brax._envs  # by users too
-    return {*BRAX_NAMES, *(n for n in registered if not n.startswith("dgae_"))} - {"swimmer"}
+    return _THIRD_PARTY[kind]._replace(gymnasium_id=own_name if kind == "gymnasium" else None)
 
 
 def make_env(
@@ -146,26 +138,10 @@ def make_env(
     version = version or named_version or spec.default_version
     if engine not in spec.engines:
         raise ValueError(f"physics {engine}: must be one of {', '.join(spec.engines)}")
-    if version is not None and version not in spec.versions:
-        allowed = f"one of {', '.join(spec.versions)}" if spec.versions else "left out"
+    if version is not None and version not in spec.eval_envs:
+        allowed = f"one of {', '.join(spec.eval_envs)}" if spec.eval_envs else "left out"
         raise ValueError(f"version {version}: must be {allowed}")
-    if name in TASKS:
-        from dgae_jax.envs.gym_tasks import GYM_TASKS
-
-        return GYM_TASKS[name].make(engine, str(version), **task_parameters)
-    if spec.gymnasium_id is not None:
-        from dgae_jax.envs.gymnasium import GymnasiumTask
-
-        return GymnasiumTask(spec.gymnasium_id, **task_parameters)
-    if name in CUSTOM_ENVS:
-        from dgae_jax.envs.custom import make_custom
-
-        return make_custom(CUSTOM_ENVS[name], **task_parameters)
-    kind, _, own_name = name.partition(":")
-    if kind == "brax":
-        from dgae_jax.envs.custom import make_brax
-
-        return make_brax(own_name, engine, **task_parameters)
-    from dgae_jax.envs.playground import make_playground
-
-    return make_playground(own_name, engine, **task_parameters)
+    if spec.eval_envs:
+        task_parameters["version"] = version
+    own_name = name.partition(":")[2] or name
+    return resolve_name(spec.builder)(own_name, engine, **task_parameters)

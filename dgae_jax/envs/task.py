@@ -17,7 +17,6 @@ from jaxtyping import Array, ArrayLike, Bool, Float
 
 from dgae_jax.envs.base import Env, State
 from dgae_jax.physics.engine import Physics, PhysicsState, Reads
-from dgae_jax.physics.registry import make_physics
 
 
 def load_spec(filename: str) -> mujoco.MjSpec:
@@ -53,14 +52,6 @@ class Task(Env):
     """Leading positions that the observation excludes: one for x, two for x and y."""
     VELOCITY_LIMIT: ClassVar[float] = inf
     """Bound on observed velocities."""
-    TERMS: ClassVar[tuple[str, ...]] = ("reward_forward", "reward_ctrl")
-    """Names of the terms of the reward."""
-
-    @classmethod
-    def make(cls, physics: str, version: str, **parameters) -> "Task":
-        """Build the task over the engine named `physics`."""
-        spec, reads = load_spec(cls.FILE[version]), cls.reads(version, **parameters)
-        return cls(make_physics(physics, spec, cls.FRAME_SKIP, reads), version, **parameters)
 
     # ---- to override in a task ----
 
@@ -72,7 +63,7 @@ class Task(Env):
     def _terms(
         self, before: PhysicsState, after: PhysicsState, action: Array, velocity: Array
     ) -> dict[str, Array]:
-        """Return the terms of the reward, in the order of `TERMS`; their sum is the reward."""
+        """Return the terms of the reward; their sum is the reward."""
         return {
             "reward_forward": self.forward_reward_weight * velocity[0],
             "reward_ctrl": -self.ctrl_cost_weight * jnp.square(action).sum(),
@@ -158,8 +149,9 @@ class Task(Env):
 
     def _at(self, physics_state: PhysicsState) -> State:
         position, zero = self._position(physics_state), jnp.zeros((), physics_state.qpos.dtype)
-        motion = self._motion_metrics(position, jnp.zeros_like(position))
-        metrics = dict.fromkeys(self.TERMS, zero) | motion
+        velocity, action = jnp.zeros_like(position), jnp.zeros(self.action_size)
+        terms = self._terms(physics_state, physics_state, action, velocity)
+        metrics = dict.fromkeys(terms, zero) | self._motion_metrics(position, velocity)
         obs = self._observation(physics_state)
         return State(physics_state, obs, zero, zero, metrics)  # pyright: ignore
 
@@ -178,8 +170,6 @@ class HealthyTask(Task):
 
     healthy_reward: float = 1.0
     terminate_when_unhealthy: bool = True
-
-    TERMS = (*Task.TERMS, "reward_survive")
 
     def _is_healthy(self, state: PhysicsState) -> Bool[Array, ""]:
         raise NotImplementedError

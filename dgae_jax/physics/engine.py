@@ -5,22 +5,25 @@ a function of a model (`MjSpec`), the number of substeps and `Reads` that return
 raises ValueError for a model that it does not cover; `registry` names them.
 """
 
-from typing import NamedTuple, Protocol, runtime_checkable
+from collections.abc import Callable
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import mujoco
-import numpy as np
 from jaxtyping import Array, Float
+
+if mujoco.get_mju_user_warning() is None:  # they would be printed and written to MUJOCO_LOG.TXT
+    mujoco.set_mju_user_warning(lambda message: None)
 
 
 class Reads(NamedTuple):
     """The quantities that a task reads besides positions and velocities."""
 
-    bodies: tuple[str, ...] = ()
-    """Names of bodies for `xpos`; each must have a free joint (`body_ids`)."""
-    forces: bool = False
-    """True if the task reads `cfrc_ext`."""
+    xpos: bool = False
+    """True if the task reads the position of the root, which must have a free joint."""
+    cfrc_ext: bool = False
+    """True if the task reads the external forces."""
 
 
 class PhysicsState(NamedTuple):
@@ -37,16 +40,13 @@ class PhysicsState(NamedTuple):
     qacc_warmstart: Float[Array, "*batch V"]
     """The last acceleration [m/s², rad/s²], where the constraint solver starts."""
     xpos: Float[Array, "*batch B 3"]
-    """Positions of the bodies in `Reads.bodies` [m]."""
+    """Position of the root [m]; B = 0 unless `Reads.xpos`."""
     cfrc_ext: Float[Array, "*batch E 6"]
-    """External torque and force on each body [Nm, N]; E = 0 unless `Reads.forces`."""
+    """External torque and force on each body [Nm, N]; E = 0 unless `Reads.cfrc_ext`."""
 
 
-@runtime_checkable
-class StepFn(Protocol):
-    """Advance by `frame_skip` substeps under the control `ctrl` [U]; may be jitted and vmapped."""
-
-    def __call__(self, state: PhysicsState, ctrl: Array, /) -> PhysicsState: ...
+StepFn = Callable[[PhysicsState, Array], PhysicsState]
+"""Advances by `frame_skip` substeps under the control `ctrl` [U]; may be jitted and vmapped."""
 
 
 class Physics(NamedTuple):
@@ -61,36 +61,17 @@ class Physics(NamedTuple):
     def init(self, qpos: Float[Array, "*batch Q"], qvel: Float[Array, "*batch V"]) -> PhysicsState:
         """Return the state at a pose, with the cold warm start of a fresh `mjData`.
 
-        No forward pass: bodies that a task reads float freely, so `xpos` is a part of `qpos`.
+        No forward pass: a root that a task reads floats freely, so `xpos` is a part of `qpos`.
         """
-        model, batch = self.model, qpos.shape[:-1]
-        addresses = model.jnt_qposadr[model.body_jntadr[body_ids(model, self.reads)]]
-        xpos = qpos[..., addresses[:, None] + np.arange(3)]
-        forces = jnp.zeros((*batch, model.nbody if self.reads.forces else 0, 6), qpos.dtype)
+        batch, bodies = qpos.shape[:-1], self.model.nbody if self.reads.cfrc_ext else 0
+        xpos = qpos[..., None, :3] if self.reads.xpos else jnp.zeros((*batch, 0, 3), qpos.dtype)
+        forces = jnp.zeros((*batch, bodies, 6), qpos.dtype)
         return PhysicsState(qpos, qvel, jnp.zeros_like(qvel), xpos, forces)
-
-
-def body_ids(model: mujoco.MjModel, reads: Reads) -> np.ndarray:
-    """Return the ids of the bodies that a task reads.
-
-    Raises:
-        ValueError: if a body is not in the model or has no free joint.
-    """
-    ids = [mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, name) for name in reads.bodies]
-    for body, name in zip(ids, reads.bodies, strict=True):
-        if body < 0:
-            raise ValueError(f"the model has no body {name!r}")
-        joint = model.body_jntadr[body]
-        if joint < 0 or model.jnt_type[joint] != mujoco.mjtJoint.mjJNT_FREE:
-            raise ValueError(f"the position of body {name!r} cannot be read: it has no free joint")
-    return np.array(ids, int)
 
 
 def refuse_hidden_state(model: mujoco.MjModel, name: str) -> None:
     """Raise ValueError for a model with a state that `PhysicsState` does not carry."""
-    states = {"activations": "na", "histories": "nhistory", "user data": "nuserdata"}
-    states["plugin states"] = "npluginstate"
-    found = [state for state, size in states.items() if getattr(model, size, 0)]
+    found = [n for n in ("na", "nhistory", "nuserdata", "npluginstate") if getattr(model, n)]
     if found:
         raise ValueError(f"physics {name} does not cover {', '.join(found)}, which the model has")
 

@@ -21,15 +21,16 @@ with contextlib.redirect_stdout(io.StringIO()):  # MJX prints that Warp is not i
 
 def mjx(spec: mujoco.MjSpec, frame_skip: int, reads: Reads) -> Physics:
     """Build MJX over its JAX code, on any device."""
-    model, device_model, bodies = _compile(spec, reads, "mjx", "jax")
+    model, device_model = _compile(spec, "mjx", "jax")
 
     @jax.default_matmul_precision("highest")  # TF32 on GPUs is too coarse for dynamics
     def step(state: PhysicsState, ctrl: Array) -> PhysicsState:
         blank = upstream.make_data(model, impl="jax")
         data, cfrc_ext = _substeps(device_model, blank, state, ctrl, frame_skip), state.cfrc_ext
-        if reads.forces:
+        if reads.cfrc_ext:
             cfrc_ext = upstream.rne_postconstraint(device_model, data)._impl.cfrc_ext
-        return PhysicsState(data.qpos, data.qvel, data.qacc_warmstart, data.xpos[bodies], cfrc_ext)
+        xpos = data.xpos[1 : 1 + reads.xpos]
+        return PhysicsState(data.qpos, data.qvel, data.qacc_warmstart, xpos, cfrc_ext)
 
     return Physics(model, step, "mjx", reads)
 
@@ -42,8 +43,8 @@ def mjx_warp(spec: mujoco.MjSpec, frame_skip: int, reads: Reads) -> Physics:
     import warp  # pyright: ignore[reportMissingImports]
 
     warp.config.log_level = warp.LOG_WARNING  # it announces itself and every kernel that it loads
-    model, device_model, bodies = _compile(spec, reads, "mjx-warp", "warp")
-    forces = {"opt._impl.run_rne_postconstraint": reads.forces}
+    model, device_model = _compile(spec, "mjx-warp", "warp")
+    forces = {"opt._impl.run_rne_postconstraint": reads.cfrc_ext}
     device_model: Any = device_model.tree_replace(forces)
     contacts = upstream.make_data(model, impl="warp")._impl.naconmax
 
@@ -52,8 +53,8 @@ def mjx_warp(spec: mujoco.MjSpec, frame_skip: int, reads: Reads) -> Physics:
 
         def one(state: PhysicsState, ctrl: Array) -> PhysicsState:
             data = _substeps(device_model, blank, state, ctrl, frame_skip)
-            cfrc_ext = data._impl.cfrc_ext if reads.forces else state.cfrc_ext
-            xpos = data.xpos[bodies]
+            cfrc_ext = data._impl.cfrc_ext if reads.cfrc_ext else state.cfrc_ext
+            xpos = data.xpos[1 : 1 + reads.xpos]
             return PhysicsState(data.qpos, data.qvel, data.qacc_warmstart, xpos, cfrc_ext)
 
         single = jax.tree.map(lambda x: x.astype(jnp.float32), (state, ctrl))
@@ -63,15 +64,15 @@ def mjx_warp(spec: mujoco.MjSpec, frame_skip: int, reads: Reads) -> Physics:
     return Physics(model, engine.single_env(batched_step), "mjx-warp", reads)
 
 
-def _compile(spec: mujoco.MjSpec, reads: Reads, name: str, impl: str):
-    """Return the model, MJX's model, and the ids of the bodies to read."""
+def _compile(spec: mujoco.MjSpec, name: str, impl: str):
+    """Return the model and MJX's model."""
     spec = spec.copy()
     for numeric in list(spec.numerics):  # MJX 3.17 takes the first for its own limit on contacts
         spec.delete(numeric)
     model = spec.compile()
     engine.refuse_hidden_state(model, name)
     try:
-        return model, upstream.put_model(model, impl=impl), engine.body_ids(model, reads)
+        return model, upstream.put_model(model, impl=impl)
     except NotImplementedError as reason:
         raise ValueError(f"physics {name} does not cover this model: {reason}") from None
 

@@ -7,7 +7,6 @@ import contextlib
 import hashlib
 import logging
 import math
-import threading
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from functools import partial
@@ -19,33 +18,13 @@ from jaxtyping import Array
 from mujoco.batch import Batch
 
 from dgae_jax.physics import cores, ffi
-from dgae_jax.physics.engine import Physics, PhysicsState, Reads, body_ids, refuse_hidden_state
+from dgae_jax.physics.engine import Physics, PhysicsState, Reads, refuse_hidden_state
 
 _LOG = logging.getLogger(__name__)
 _INPUTS = ("qpos", "qvel", "qacc_warmstart")
 
 WARNING_COUNTS: Counter[str] = Counter()
 """Warnings of C MuJoCo in this process while `native` stepped, by MuJoCo's name."""
-_lock, _callers, _handler = threading.Lock(), 0, None
-"""Callers inside `silence_warnings`, and the handler to restore after the last one."""
-
-
-@contextlib.contextmanager
-def silence_warnings() -> Iterator[None]:
-    """Keep MuJoCo's warnings, from any thread, off stderr and out of MUJOCO_LOG.TXT."""
-    global _callers, _handler
-    with _lock:
-        if not _callers:
-            _handler = mujoco.get_mju_user_warning()
-            mujoco.set_mju_user_warning(lambda message: None)
-        _callers += 1
-    try:
-        yield
-    finally:
-        with _lock:
-            _callers -= 1
-            if not _callers:
-                mujoco.set_mju_user_warning(_handler)
 
 
 def _count_warnings(new: np.ndarray) -> None:
@@ -62,20 +41,20 @@ class _Simulations:
 
     def __init__(self, model: mujoco.MjModel, frame_skip: int, reads: Reads):
         self.model, self.frame_skip, self.reads = model, frame_skip, reads
-        self.bodies = body_ids(model, reads)
         self.free: dict[int, list[Batch]] = {}
 
     def step(self, before: Sequence[np.ndarray], after: Sequence[np.ndarray]) -> None:
         """Fill the fields of a `PhysicsState` from `_INPUTS` and the control before the step."""
         count = math.prod(before[0].shape[:-1])
-        with self._batch(count) as batch, silence_warnings():
+        with self._batch(count) as batch:
             for name, array in zip((*_INPUTS, "ctrl"), before, strict=True):
                 batch.bind(name)[:] = array.reshape(count, -1)
             warnings = batch.warning[..., 1].sum(0)
             batch.step(nstep=self.frame_skip)
             _count_warnings(batch.warning[..., 1].sum(0) - warnings)
-            forces = self._forces(batch) if self.reads.forces else np.empty((count, 0, 6))
-            values = (*map(batch.bind, _INPUTS), batch.bind("xpos")[:, self.bodies], forces)
+            forces = self._forces(batch) if self.reads.cfrc_ext else np.empty((count, 0, 6))
+            xpos = batch.bind("xpos")[:, 1 : 1 + self.reads.xpos]
+            values = (*map(batch.bind, _INPUTS), xpos, forces)
             for array, value in zip(after, values, strict=True):
                 array[:] = value.reshape(array.shape)
 
@@ -95,7 +74,7 @@ class _Simulations:
         except IndexError:
             threads = max(1, cores() // jax.local_device_count("cpu"))
             # persistent simulations keep the contacts that the forces are computed from
-            batch = Batch(self.model, count, min(threads, count), persistent=self.reads.forces)
+            batch = Batch(self.model, count, min(threads, count), persistent=self.reads.cfrc_ext)
             batch.bind("xpos")  # outputs are copied from the next call on
         yield batch
         free.append(batch)

@@ -4,6 +4,7 @@ Importing this loads no engine: names are checked before JAX or MuJoCo are impor
 """
 
 from importlib.util import find_spec
+from pkgutil import resolve_name
 from typing import TYPE_CHECKING, NamedTuple
 
 if TYPE_CHECKING:
@@ -13,30 +14,24 @@ if TYPE_CHECKING:
 
 
 class Engine(NamedTuple):
-    """An engine and its requirements."""
+    """An engine, and what it needs."""
 
-    on_host: bool = False
-    """True if it simulates on the CPU whatever JAX's device is."""
+    builder: str
+    """Where the function is that builds it."""
     package: str | None = None
     """Name of the module needed, which is also the name of our extra."""
 
 
 ENGINES = {
-    "jax": Engine(),
-    "mjx": Engine(),
-    "mjx-warp": Engine(package="warp"),
-    "native": Engine(on_host=True),
+    "jax": Engine("dgae_jax.physics.jax.forward:jax_engine"),
+    "mjx": Engine("dgae_jax.physics.mjx:mjx"),
+    "mjx-warp": Engine("dgae_jax.physics.mjx:mjx_warp", package="warp"),
+    "native": Engine("dgae_jax.physics.native:native"),
 }
 
 
 def require(name: str) -> None:
-    """Check that an engine can be used.
-
-    Raises:
-        ValueError: if `name` is unknown or its package is not installed.
-    """
-    if name not in ENGINES:
-        raise ValueError(f"unknown physics {name!r}: must be one of {', '.join(ENGINES)}")
+    """Raise ValueError if the package of an engine is not installed."""
     package = ENGINES[name].package
     if package is not None and find_spec(package) is None:
         reason = f"needs the package {package}, which is not installed"
@@ -47,15 +42,7 @@ def make_physics(name: str, spec: "mujoco.MjSpec", frame_skip: int, reads: "Read
     """Build the engine `name` over a model, with `frame_skip` substeps per control interval.
 
     Raises:
-        ValueError: if the engine is unknown, not installed, or does not cover the model.
+        ValueError: if the engine is not installed, or does not cover the model.
     """
     require(name)
-    if name == "jax":
-        from dgae_jax.physics.jax.forward import jax_engine as build
-    elif name == "native":
-        from dgae_jax.physics.native import native as build
-    elif name == "mjx":
-        from dgae_jax.physics.mjx import mjx as build
-    else:
-        from dgae_jax.physics.mjx import mjx_warp as build
-    return build(spec, frame_skip, reads)
+    return resolve_name(ENGINES[name].builder)(spec, frame_skip, reads)

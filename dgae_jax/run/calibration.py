@@ -11,7 +11,6 @@ from jaxtyping import Array, Float, Key
 
 from dgae_jax.configs.config import CriticConfig, invalid
 from dgae_jax.configs.resolved import ResolvedConfig, resolve
-from dgae_jax.envs.base import has_limit
 from dgae_jax.learn.build import make_quantiles, make_task
 from dgae_jax.learn.diagnostics import SIMILAR, similar_means
 from dgae_jax.learn.networks import value_network
@@ -66,7 +65,7 @@ def return_steps(config: ResolvedConfig) -> int:
     if steps == MAX_RETURN_STEPS:
         limit = f"at most {NEGLIGIBLE ** (1 / MAX_RETURN_STEPS):.4f}, so that returns end"
         raise invalid("gamma", config.gamma, limit)
-    if has_limit(make_task(config)):
+    if "truncation" in jax.eval_shape(make_task(config).reset, jax.random.key(0)).info:
         raise invalid("env", config.env, "a task without a time limit of its own")
     return steps
 

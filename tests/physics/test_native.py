@@ -5,7 +5,6 @@ from collections import Counter
 
 import jax
 import jax.numpy as jnp
-import mujoco
 import pytest
 from numpy.testing import assert_array_equal
 
@@ -27,7 +26,7 @@ def test_nested_vmaps_and_single_env_have_the_same_bits():
 
 @pytest.mark.parametrize("forces", [False, True])
 def test_callback_of_other_devices_returns_the_same_bits(forces):
-    reads = Reads(("torso",), forces)
+    reads = Reads(xpos=True, cfrc_ext=forces)
     physics = native(load_spec("ant.xml"), 5, reads)
     state, ctrl = start(physics, "ant", 2, 3)
     after = jax.jit(jax.vmap(jax.vmap(physics.step)))(state, ctrl)
@@ -50,7 +49,7 @@ def test_non_finite_state_stays_visible():
 def test_warnings_are_counted_and_logged_once(forces, monkeypatch, tmp_path, capfd, caplog):
     monkeypatch.setattr(native_module, "WARNING_COUNTS", Counter())
     monkeypatch.chdir(tmp_path)
-    physics = native(load_spec("hopper.xml"), 4, Reads(forces=forces))
+    physics = native(load_spec("hopper.xml"), 4, Reads(cfrc_ext=forces))
     state, ctrl = start(physics, "hopper", 8)
     broken = physics.init(state.qpos.at[:3, 2].set(jnp.nan), state.qvel)
     step = jax.jit(jax.vmap(physics.step))
@@ -63,15 +62,3 @@ def test_warnings_are_counted_and_logged_once(forces, monkeypatch, tmp_path, cap
     assert len(caplog.records) == len(native_module.WARNING_COUNTS)
     assert "WARNING" not in capfd.readouterr().err
     assert list(tmp_path.iterdir()) == []
-
-
-def test_warning_handler_is_restored():
-    heard = []
-    mujoco.set_mju_user_warning(heard.append)
-    handler = mujoco.get_mju_user_warning()
-    try:
-        with native_module.silence_warnings(), native_module.silence_warnings():
-            assert mujoco.get_mju_user_warning() != handler
-        assert mujoco.get_mju_user_warning() == handler
-    finally:
-        mujoco.set_mju_user_warning(None)

@@ -62,21 +62,14 @@ class Contact(NamedTuple):
     tangent: Float[Array, "K 3 N"]
 
 
-def known_max_contacts(name: str, model: mujoco.MjModel) -> int | None:
-    """Return the bound on ground contacts that is known for a model; None where none is."""
-    ground = [geom2 for geom1, geom2 in _geom_pairs(model) if model.geom_type[geom1] == PLANE]
-    possible = sum(2 if model.geom_type[geom] == CAPSULE else 1 for geom in ground)
-    return _MAX_CONTACTS.get((name, possible))
-
-
-def contact_groups(m: Model, max_contacts: int | None = None) -> list[ContactGroup]:
-    """Read the possible contacts; `max_contacts` bounds those with the ground."""
+def contact_groups(m: Model, name: str) -> list[ContactGroup]:
+    """Read the possible contacts of the model `name`."""
     mj = m.mj
     pairs: dict[tuple[bool, int], list[tuple[int, int]]] = {}
     for pair in _geom_pairs(mj):
         dim = 1 if max(mj.geom_condim[list(pair)]) == 1 else 3
         pairs.setdefault((bool(mj.geom_type[pair[0]] == PLANE), dim), []).append(pair)
-    return [_group(m, np.array(p), *kind, max_contacts) for kind, p in pairs.items()]
+    return [_group(m, name, np.array(p), *kind) for kind, p in pairs.items()]
 
 
 def _geom_pairs(model: mujoco.MjModel) -> Iterator[tuple[int, int]]:
@@ -93,9 +86,7 @@ def _geom_pairs(model: mujoco.MjModel) -> Iterator[tuple[int, int]]:
                 yield int(one), int(two)
 
 
-def _group(
-    m: Model, pairs: np.ndarray, ground: bool, dim: int, max_contacts: int | None
-) -> ContactGroup:
+def _group(m: Model, name: str, pairs: np.ndarray, ground: bool, dim: int) -> ContactGroup:
     mj = m.mj
     if ground:  # a capsule touches the ground with either end
         signs = [(1, -1) if mj.geom_type[two] == CAPSULE else (1,) for _, two in pairs]
@@ -118,8 +109,8 @@ def _group(
         return ContactGroup(dim, params, _geoms(m, one), geom2, len(pairs))
     normals = np.array([quat_to_mat(mj.geom_quat[g])[:, 2] for g in one])
     planes = np.c_[normals, (normals * mj.geom_pos[one]).sum(1)]
-    kept = min(len(pairs), len(pairs) if max_contacts is None else max_contacts)
-    return ContactGroup(dim, params, planes, geom2, kept)
+    max_contacts = _MAX_CONTACTS.get((name, len(pairs)), len(pairs))
+    return ContactGroup(dim, params, planes, geom2, max_contacts)
 
 
 def _geoms(m: Model, geoms: np.ndarray) -> Geoms:

@@ -9,9 +9,9 @@ import jax.numpy as jnp
 import mujoco
 from jaxtyping import Array
 
-from dgae_jax.physics.engine import Physics, PhysicsState, Reads, StepFn, body_ids, single_env
+from dgae_jax.physics.engine import Physics, PhysicsState, Reads, StepFn, single_env
 from dgae_jax.physics.jax import math, solver
-from dgae_jax.physics.jax.collision import collision, contact_groups, known_max_contacts
+from dgae_jax.physics.jax.collision import collision, contact_groups
 from dgae_jax.physics.jax.constraint import make_constraint, rne_postconstraint
 from dgae_jax.physics.jax.model import put_model
 from dgae_jax.physics.jax.smooth import smooth
@@ -19,37 +19,27 @@ from dgae_jax.physics.jax.smooth import smooth
 _RK4_A = (0.0, 0.5, 0.5, 1.0)
 _RK4_B = (1 / 6, 1 / 3, 1 / 3, 1 / 6)
 _BLOCK = 128  # envs computed together on a CPU, to fit its cache
-_HAS_RKMK = int(mujoco.__version__.split(".")[0]) >= 4  # C corrects the rotation of a free joint
 
 
-def jax_engine(
-    spec: mujoco.MjSpec, frame_skip: int, reads: Reads, *, max_contacts: int | None = None
-) -> Physics:
-    """Build MuJoCo in JAX.
-
-    `max_contacts` bounds the contacts with the ground, of which the nearest are kept; by default it
-    is the bound that is known for the model, or all that are possible.
-    """
+def jax_engine(spec: mujoco.MjSpec, frame_skip: int, reads: Reads) -> Physics:
+    """Build MuJoCo in JAX."""
     model = spec.compile()
     m = put_model(model)
-    if max_contacts is None:
-        max_contacts = known_max_contacts(spec.modelname, model)
-    groups = contact_groups(m, max_contacts)
+    groups = contact_groups(m, spec.modelname)
     h, free = model.opt.timestep, m.has_free_root
-    bodies = len(body_ids(model, reads))  # 0 or 1: only the root can have a free joint
 
     def forward(qacc_warmstart, qpos, qvel, ctrl):
         """Return `qacc`, and `xpos` and `cfrc_ext` as far as they are read."""
         s = smooth(m, qpos, qvel, ctrl)
-        xpos = jnp.repeat(s.frames[:1, :, 3], bodies, 0)
-        cfrc_ext = jnp.zeros((model.nbody if reads.forces else 0, 6, qpos.shape[-1]), qpos.dtype)
+        xpos = s.frames[: int(reads.xpos), :, 3]
+        cfrc_ext = jnp.zeros((model.nbody if reads.cfrc_ext else 0, 6, qpos.shape[-1]), qpos.dtype)
         if not groups and not model.jnt_limited.any():
             return math.solve(s.qM, s.qfrc_smooth), (xpos, cfrc_ext)
         contacts = collision(groups, s.frames)
         constraint = make_constraint(m, contacts, s, qpos, qvel)
         problem = solver.Problem(s.qM, s.qfrc_smooth, *constraint)
         solution = solver.solve(problem, qacc_warmstart)
-        if reads.forces:
+        if reads.cfrc_ext:
             efc_force = -constraint.efc_D * jnp.minimum(solution.Jaref, 0)
             cfrc_ext = rne_postconstraint(m, contacts, s.subtree_com, efc_force)
         return solution.qacc, (xpos, cfrc_ext)
@@ -62,7 +52,7 @@ def jax_engine(
             a, b = tableau
             qvel = v + a * h * k_v
             qacc, seen = forward(k_v, _integrate_pos(q, a * h * k_q, free), qvel, ctrl)
-            if free and _HAS_RKMK:
+            if free:  # as C corrects the rotation of a free joint
                 qvel = qvel.at[3:6].set(_dexp_inv(a * h * k_q[3:6], qvel[3:6]))
             return ((qvel, qacc), (sum_q + b * qvel, sum_v + b * qacc), seen), None
 

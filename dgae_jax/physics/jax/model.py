@@ -131,6 +131,14 @@ def _joint_terms(model: mujoco.MjModel, joint: int, pose: Pose) -> np.ndarray:
     return terms
 
 
+_ZERO = (
+    "na", "neq", "ntendon", "npair", "nexclude", "body_gravcomp", "jnt_actfrclimited",
+    "jnt_stiffnesspoly", "dof_frictionloss", "dof_dampingpoly", "actuator_forcelimited",
+    "actuator_armature", "actuator_damping", "actuator_dampingpoly", "actuator_delay",
+)  # fmt: skip
+"""Fields of `mjModel` that are zero in every model that the engine covers."""
+
+
 def _refuse_uncovered(m: mujoco.MjModel) -> None:
     joint, geom, opt = mujoco.mjtJoint, mujoco.mjtGeom, m.opt
     free, root = m.jnt_type == FREE, np.arange(m.njnt) == 0
@@ -154,30 +162,20 @@ def _refuse_uncovered(m: mujoco.MjModel) -> None:
         "ball joints, or free joints below the root": ~simple,
         "springs at free joints": m.jnt_stiffness[free],
         "more than one tree": m.body_rootid[1:] != 1,
-        "activations": m.na,
         "actuators other than motors at hinges and slides": ~motor,
-        "limits on forces": np.r_[m.actuator_forcelimited, m.jnt_actfrclimited],
-        "equality constraints": m.neq,
-        "tendons": m.ntendon,
-        "friction loss": m.dof_frictionloss,
         "elliptic friction cones": opt.cone != mujoco.mjtCone.mjCONE_PYRAMIDAL,
         "torsional friction": collides & (m.geom_condim > 3),
         "contacts without friction": collides & (m.geom_friction[:, 0] < mujoco.mjMINMU),
         "joint limits with margins that overlap": (m.jnt_limited > 0) & overlap,
         "bodies without mass in a fluid": fluid & (m.body_mass[1:] < mujoco.mjMINVAL),
-        "contact pairs or exclusions": m.npair + m.nexclude,
         "colliding geoms other than spheres and capsules over planes": collides & ~shaped,
         "contact softness given as stiffness and damping": collides[:, None] & (m.geom_solref <= 0),
         "geoms of different priority or weight": [np.ptp(x) for x in mixing if len(x)],
-        "gravity compensation": m.body_gravcomp,
         "wind": opt.wind,
         "the ellipsoid fluid model": m.geom_fluid[:, 0],
         "option flags other than the default": flags | opt.disableactuator,
     }
-    # fields of newer versions of MuJoCo, all zero in a plain model
-    for name in ("jnt_stiffnesspoly", "dof_dampingpoly", "actuator_armature", "actuator_damping",
-                 "actuator_dampingpoly", "actuator_delay"):  # fmt: skip
-        reasons[name.replace("_", " ")] = getattr(m, name, 0)
+    reasons |= {name: getattr(m, name) for name in _ZERO}
     found = [reason for reason, present in reasons.items() if np.any(present)]
     if found:
         raise ValueError(f"physics jax does not cover {', '.join(found)}, which the model has")
