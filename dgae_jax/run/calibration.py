@@ -55,13 +55,18 @@ class MonteCarlo(NamedTuple):
     """Discounted sum of the unscaled rewards from each step on."""
 
 
+def steps_that_count(gamma: float) -> int:
+    """Return how many rewards of a return weigh more than `NEGLIGIBLE`."""
+    return int(np.count_nonzero(gamma ** np.arange(MAX_RETURN_STEPS) > NEGLIGIBLE))
+
+
 def return_steps(config: ResolvedConfig) -> int:
-    """Return how many rewards of a return weigh more than `NEGLIGIBLE`.
+    """Return `steps_that_count`, where returns end.
 
     Raises:
         ConfigError: returns have no end, by γ near 1 or a time limit of the task.
     """
-    steps = int(np.count_nonzero(config.gamma ** np.arange(MAX_RETURN_STEPS) > NEGLIGIBLE))
+    steps = steps_that_count(config.gamma)
     if steps == MAX_RETURN_STEPS:
         limit = f"at most {NEGLIGIBLE ** (1 / MAX_RETURN_STEPS):.4f}, so that returns end"
         raise invalid("gamma", config.gamma, limit)
