@@ -21,7 +21,8 @@ import tyro
 import dgae_jax as dg
 from dgae_jax.configs.resolved import resolve
 from dgae_jax.envs.registry import TASKS
-from dgae_jax.learn.build import make_task, make_trainer, seed_keys
+from dgae_jax.learn.build import make_task, seed_keys
+from dgae_jax.learn.parallel import make_trainer
 
 
 @dataclass(frozen=True)

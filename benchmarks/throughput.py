@@ -36,9 +36,9 @@ from turns import counted
 import dgae_jax as dg
 from dgae_jax.configs.resolved import ResolvedConfig, resolve
 from dgae_jax.learn import devices
-from dgae_jax.learn.build import make_policy, make_task, make_trainer, seed_keys
+from dgae_jax.learn.build import make_policy, make_task, seed_keys
 from dgae_jax.learn.iteration import _estimate, _roll_out, sampler
-from dgae_jax.learn.parallel import COMPILER_OPTIONS
+from dgae_jax.learn.parallel import COMPILER_OPTIONS, make_trainer
 from dgae_jax.learn.types import InferenceState
 from dgae_jax.physics import cores
 from dgae_jax.run import runtime

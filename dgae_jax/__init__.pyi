@@ -3,7 +3,8 @@ from .configs.presets import preset
 from .configs.resolved import ResolvedConfig, resolve
 from .envs.registry import make_env
 from .export.vector import make_vector_env
-from .learn.build import make_algorithm, make_train, register
+from .learn.build import make_algorithm, register
+from .learn.iteration import make_train
 from .maths.returns import (
     bellman_target,
     dgae,

@@ -1,4 +1,4 @@
-"""Tasks, networks, algorithms and training steps of a configuration; registration of parts."""
+"""Tasks, networks and algorithms of a configuration; registration of parts."""
 
 import dataclasses
 from collections.abc import Callable
@@ -6,22 +6,18 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-from jax.sharding import Mesh
 
 from dgae_jax.configs import config as user
 from dgae_jax.configs import parts, resolved
 from dgae_jax.configs.config import Config, ConfigError
 from dgae_jax.configs.resolved import Options, ResolvedConfig, resolve
 from dgae_jax.envs.base import Env
-from dgae_jax.envs.custom import with_range
 from dgae_jax.envs.noise import Noisy
 from dgae_jax.envs.registry import make_env
-from dgae_jax.learn import iteration, parallel
 from dgae_jax.learn.critics import CRITICS, RESIDUALS, TARGETS
-from dgae_jax.learn.iteration import InitFn, TrainStep
-from dgae_jax.learn.networks import COVARIANCES, gaussian_policy
+from dgae_jax.learn.networks import COVARIANCES, network
 from dgae_jax.learn.normalizers import normalize
-from dgae_jax.learn.types import Algorithm, InferenceState, Policy, TrainState
+from dgae_jax.learn.types import Algorithm, InferenceState, Network, TrainState
 from dgae_jax.learn.updates import OPTIMIZERS, UPDATES, minibatch_update
 from dgae_jax.maths.risk import weights_of
 
@@ -62,16 +58,11 @@ def make_task(config: ResolvedConfig) -> Env:
     return Noisy(env, **noise) if any(noise.values()) else env
 
 
-def make_policy(env: Env, config: ResolvedConfig) -> Policy:
+def make_policy(env: Env, config: ResolvedConfig) -> Network:
     """Return the policy network of a configuration, sized for `env`."""
     policy = config.policy
-    return gaussian_policy(
-        _obs_size(env),
-        env.action_size,
-        hidden=policy.hidden,
-        covariance=COVARIANCES[policy.covariance],
-        initial_std=policy.initial_std,
-    )
+    covariance = COVARIANCES[policy.covariance]
+    return network(covariance(policy.hidden, env.action_size, policy.initial_std), _obs_size(env))
 
 
 def make_algorithm(name: str, env: Env, config: Config | ResolvedConfig) -> Algorithm:
@@ -88,42 +79,18 @@ def make_algorithm(name: str, env: Env, config: Config | ResolvedConfig) -> Algo
     config = resolve(config, name)
     policy, critic = make_policy(env, config), config.critic
     iterations = config.total_steps / config.samples_per_iteration
-    network = CRITICS[critic.kind](
-        _obs_size(env), hidden=critic.hidden, target=TARGETS[critic.target], **critic.options
+    target = TARGETS[critic.target]
+    values = CRITICS[critic.kind](
+        _obs_size(env), hidden=critic.hidden, target=target, **critic.options
     )
     weights = weights_of(config.metric, critic.outputs) if critic.is_distribution else None
     return Algorithm(
         policy=policy,
-        critic=network,
+        critic=values,
         residual=RESIDUALS[config.residual](weights),
         policy_update=UPDATES[config.policy.update](policy, iterations, **config.policy.options),
-        critic_update=minibatch_update(network.loss, iterations, **critic.fit),
+        critic_update=minibatch_update(values.loss, iterations, **critic.fit),
     )
-
-
-def make_train(
-    algorithm: Algorithm, env: Env, config: Config | ResolvedConfig
-) -> tuple[InitFn, TrainStep]:
-    """Return `init(key) -> state` and `train_step(state) -> (state, metrics)`.
-
-    Args:
-        algorithm: made by `make_algorithm`, or a record of your own parts.
-        env: the task; without an `action_range` its actions lie in [−1, 1].
-        config: the run.
-
-    Raises:
-        ConfigError: the configuration is invalid.
-    """
-    return iteration.make_train(algorithm, with_range(env), resolve(config))
-
-
-def make_trainer(env: Env, capacity: int, mesh: Mesh | None = None) -> parallel.Trainer:
-    """Return the compiled programs of runs on `env`; see `parallel.make_trainer`."""
-
-    def functions(config: ResolvedConfig) -> tuple[InitFn, TrainStep]:
-        return make_train(make_algorithm(config.algo, env, config), env, config)
-
-    return parallel.make_trainer(functions, capacity, mesh)
 
 
 def seed_keys(config: ResolvedConfig) -> jax.Array:
@@ -138,23 +105,23 @@ def policies_of(state: TrainState) -> InferenceState:
 
 def make_greedy(env: Env, config: ResolvedConfig) -> Infer:
     """Return `greedy(policy, obs [..., O]) -> action [..., A]`: the clipped mean action."""
-    network, (low, high) = make_policy(env, config), env.action_range
+    policy_network, (low, high) = make_policy(env, config), env.action_range
 
     @jax.default_matmul_precision("highest")  # as in training
     def greedy(policy: InferenceState, obs: jax.Array) -> jax.Array:
         obs = normalize(policy.obs_stats, obs)
-        return jnp.clip(network.apply(policy.params, obs).mean, low, high)
+        return jnp.clip(policy_network.apply(policy.params, obs).mean, low, high)
 
     return greedy
 
 
 def make_quantiles(env: Env, config: ResolvedConfig) -> Infer:
     """Return `quantiles(critic, obs [..., O]) -> [..., K]` of the scaled return."""
-    network = make_algorithm(config.algo, env, config).critic
+    predict = make_algorithm(config.algo, env, config).critic.predict
 
     @jax.default_matmul_precision("highest")
     def quantiles(critic: InferenceState, obs: jax.Array) -> jax.Array:
-        return network.predict(critic.params, normalize(critic.obs_stats, obs))
+        return predict(critic.params, normalize(critic.obs_stats, obs))
 
     return quantiles
 

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
-from dgae_jax.learn.networks import Torso, value_network
+from dgae_jax.learn.networks import Torso, Value, network
 from dgae_jax.learn.types import Batch, Critic, Params, Residual, TargetFn
 from dgae_jax.maths.returns import (
     bellman_target,
@@ -59,7 +59,6 @@ TARGETS: dict[str, Target] = {
     "monte-carlo": Target(_sr_lambda, lam=1.0),
 }
 
-MakeTorso = Callable[[Sequence[int]], nn.Module]
 Error = Callable[[Array, Array, Array], Float[Array, " B"]]
 """`error(quantiles [B, K], target [B, J], value [B]) -> [B]`: loss of each sample."""
 
@@ -67,16 +66,17 @@ Error = Callable[[Array, Array, Array], Float[Array, " B"]]
 def _critic(
     obs_size: int,
     outputs: int,
-    hidden: Sequence[int],
-    torso: MakeTorso,
-    target: Target,
     error: Error,
+    *,
+    hidden: Sequence[int],
+    target: Target,
+    torso: Callable[[Sequence[int]], nn.Module] = Torso,
     head: Callable[[Array], Array] = jnp.asarray,
 ) -> Critic:
-    network = value_network(obs_size, outputs, hidden=hidden, torso=torso)
+    values = network(Value(hidden, outputs, torso), obs_size)
 
     def predict(params: Params, obs: Array) -> Array:
-        return head(network.apply(params, obs))
+        return head(values.apply(params, obs))
 
     def target_of(params: Params, batch: Batch) -> Array:
         if not target.recompute:
@@ -88,48 +88,33 @@ def _critic(
         errors = error(predict(params, batch.obs), target_of(params, batch), batch.value)
         return jnp.where(batch.mask, errors, 0).mean(), {}
 
-    return Critic(network.init, predict, target.compute, loss, target.lam)
+    return Critic(values.init, predict, target.compute, loss, target.lam)
 
 
-def scalar_critic(
-    obs_size: int,
-    *,
-    hidden: Sequence[int],
-    target: Target,
-    torso: MakeTorso = Torso,
-) -> Critic:
-    """Build V(s), fitted by half the squared error."""
+def scalar_critic(obs_size: int, **network) -> Critic:
+    """Build V(s), fitted by half the squared error; `network` as in `quantile_critic`."""
 
     def error(value: Array, target: Array, before: Array) -> Float[Array, " B"]:
         return 0.5 * ((value - target) ** 2).mean(-1)
 
-    return _critic(obs_size, 1, hidden, torso, target, error)
+    return _critic(obs_size, 1, error, **network)
 
 
-def quantile_critic(
-    obs_size: int,
-    *,
-    hidden: Sequence[int],
-    target: Target,
-    quantiles: int,
-    kappa: ArrayLike,
-    torso: MakeTorso = Torso,
-) -> Critic:
+def quantile_critic(obs_size: int, *, quantiles: int, kappa: ArrayLike, **network) -> Critic:
     """Build F⁻¹ of the return at K midpoints, fitted by the quantile-Huber loss.
 
     Args:
         obs_size: length of an observation.
-        hidden: widths of the hidden layers.
-        target: target of the fit.
         quantiles: their number K.
         kappa: threshold κ of the loss (Eq. quantile_huber_loss).
-        torso: flax module of the `hidden` layers.
+        network: `hidden`, widths of the hidden layers; `target` of the fit; optionally `torso`,
+            flax module of the `hidden` layers.
     """
 
     def error(quantiles: Array, target: Array, before: Array) -> Float[Array, " B"]:
         return quantile_huber_loss(quantiles, target, kappa=kappa)
 
-    return _critic(obs_size, quantiles, hidden, torso, target, error)
+    return _critic(obs_size, quantiles, error, **network)
 
 
 def sorted_critic(obs_size: int, **options) -> Critic:
@@ -145,15 +130,7 @@ SHAPE_LOSS_WEIGHT = 1 / 64
 """Small, so that the layers that both share are left to the mean."""
 
 
-def ordered_critic(
-    obs_size: int,
-    *,
-    hidden: Sequence[int],
-    target: Target,
-    quantiles: int,
-    kappa: ArrayLike,
-    torso: MakeTorso = Torso,
-) -> Critic:
+def ordered_critic(obs_size: int, *, quantiles: int, kappa: ArrayLike, **network) -> Critic:
     """Build F⁻¹ of the return at K `monotone_quantiles`; arguments as `quantile_critic`.
 
     The mean is fitted by half the squared error. The shape is fitted to how far the targets lie
@@ -167,7 +144,7 @@ def ordered_critic(
         scale = quantiles.shape[-1] / 2  # of the quantile-Huber loss of K equal quantiles, Σᵢ τ̂ᵢ
         return scale * 0.5 * (mean - target.mean(-1)) ** 2 + SHAPE_LOSS_WEIGHT * shape
 
-    return _critic(obs_size, quantiles, hidden, torso, target, error, head=monotone_quantiles)
+    return _critic(obs_size, quantiles, error, head=monotone_quantiles, **network)
 
 
 CRITICS: dict[str, Callable[..., Critic]] = {

@@ -6,8 +6,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Key
 
-from dgae_jax.configs.resolved import ResolvedConfig
+from dgae_jax.configs.config import Config
+from dgae_jax.configs.resolved import ResolvedConfig, resolve
 from dgae_jax.envs.base import Env
+from dgae_jax.envs.custom import with_range
 from dgae_jax.learn import devices, diagnostics, normalizers
 from dgae_jax.learn.rollout import Act, Episodes, rollout, start
 from dgae_jax.learn.types import (
@@ -15,7 +17,7 @@ from dgae_jax.learn.types import (
     Batch,
     InferenceState,
     Metrics,
-    Policy,
+    Network,
     TrainableState,
     TrainState,
     Transition,
@@ -30,12 +32,24 @@ TrainStep = Callable[[TrainState], tuple[TrainState, Metrics]]
 """`train_step(state) -> (state, metrics)`."""
 
 
-def make_train(algorithm: Algorithm, env: Env, config: ResolvedConfig) -> tuple[InitFn, TrainStep]:
+def make_train(
+    algorithm: Algorithm, env: Env, config: Config | ResolvedConfig
+) -> tuple[InitFn, TrainStep]:
     """Return the pure functions of a run (Algorithm policy_value_update); jit, scan and vmap them.
 
-    The env has an `action_range`, which bounds the actions. γ and λ may be traced. A step consumes
-    `num_envs * num_steps` samples.
+    Args:
+        algorithm: made by `make_algorithm`, or a record of your own parts.
+        env: the task; without an `action_range` its actions lie in [−1, 1].
+        config: the run; γ and λ may be traced.
+
+    Returns:
+        `init(key) -> state` and `train_step(state) -> (state, metrics)`; a step consumes
+        `num_envs * num_steps` samples.
+
+    Raises:
+        ConfigError: the configuration is invalid.
     """
+    env, config = with_range(env), resolve(config)
     num_envs, gamma = config.num_envs, config.gamma
     obs_size = int(env.observation_size)  # pyright: ignore[reportArgumentType]
 
@@ -116,7 +130,7 @@ def _roll_out(
     return episodes, devices.divide(step, axis=None)
 
 
-def sampler(policy: Policy, actor: InferenceState) -> Act:
+def sampler(policy: Network, actor: InferenceState) -> Act:
     """Return the function that samples actions and their log-probabilities."""
 
     def act(keys: Array, obs: Array) -> tuple[Array, Array]:
@@ -143,7 +157,8 @@ def _estimate(
     discount, trace = decay(*ends, gamma=gamma, lam=config.gae_lambda)
     delta = algorithm.residual(reward, discount, quantiles, next_quantiles)
     advantage = lambda_sum(delta, discount * trace)
-    target_trace = trace if critic.lam is None else decay(*ends, gamma=gamma, lam=critic.lam).trace
+    target_lam = config.gae_lambda if critic.lam is None else critic.lam
+    _, target_trace = decay(*ends, gamma=gamma, lam=target_lam)
     target = critic.target(key, reward, discount, target_trace, quantiles, next_quantiles)
     mean, std = advantage.mean(where=step.mask), advantage.std(where=step.mask)
     advantage = jnp.where(step.mask, (advantage - mean) / (std + 1e-8), 0)

@@ -5,21 +5,13 @@ that the first actions are noise around zero (Andrychowicz et al. 2021).
 """
 
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
 
 import flax.linen as nn
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
-from dgae_jax.learn.types import Init, Policy, Predict
+from dgae_jax.learn.types import Network
 from dgae_jax.maths.gaussian import Gaussian
-
-
-class Network(NamedTuple):
-    """A value network; `predict` of a critic adds its head."""
-
-    init: Init
-    apply: Predict
 
 
 def _dense(width: int, scale: float, bias: ArrayLike = 0.0) -> nn.Dense:
@@ -43,7 +35,7 @@ class Torso(nn.Module):
 
 
 class Value(nn.Module):
-    """Hidden layers and a linear head."""
+    """Hidden layers and a linear head with initial biases `bias`."""
 
     hidden: Sequence[int]
     outputs: int
@@ -91,38 +83,9 @@ COVARIANCES: dict[str, Callable[..., nn.Module]] = {
     "shared": SharedCovariance,
     "state": StateCovariance,
 }
+"""Policies with diagonal covariance: modules of `hidden`, `actions` and `initial_std`."""
 
 
-def _functions(module: nn.Module, obs_size: int) -> tuple[Init, Callable[..., Any]]:
-    return lambda key: module.init(key, jnp.zeros(obs_size)), module.apply
-
-
-def gaussian_policy(
-    obs_size: int,
-    action_size: int,
-    *,
-    hidden: Sequence[int],
-    covariance: Callable[..., nn.Module],
-    initial_std: ArrayLike,
-) -> Policy:
-    """Build a Gaussian policy with diagonal covariance (Sec. results, set-up).
-
-    `covariance` is a module of `hidden`, `actions` and `initial_std`, σ of the first actions; it
-    returns a Gaussian.
-    """
-    return Policy(*_functions(covariance(tuple(hidden), action_size, initial_std), obs_size))
-
-
-def value_network(
-    obs_size: int,
-    outputs: int,
-    *,
-    hidden: Sequence[int],
-    torso: Callable[[Sequence[int]], nn.Module] = Torso,
-    bias: ArrayLike = 0.0,
-) -> Network:
-    """Build a network with one scalar or K quantiles as outputs (Sec. results, set-up).
-
-    `torso` is a module of the `hidden` layers, and `bias` initializes the biases of the head.
-    """
-    return Network(*_functions(Value(tuple(hidden), outputs, torso, bias), obs_size))
+def network(module: nn.Module, obs_size: int) -> Network:
+    """Return the functions of a module that takes observations of this length."""
+    return Network(lambda key: module.init(key, jnp.zeros(obs_size)), module.apply)

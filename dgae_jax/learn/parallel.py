@@ -10,8 +10,10 @@ from jax.sharding import Mesh
 from jaxtyping import ArrayLike
 
 from dgae_jax.configs.resolved import ResolvedConfig
+from dgae_jax.envs.base import Env
 from dgae_jax.learn import devices
-from dgae_jax.learn.iteration import InitFn, TrainStep
+from dgae_jax.learn.build import make_algorithm
+from dgae_jax.learn.iteration import InitFn, TrainStep, make_train
 from dgae_jax.learn.types import Metrics, TrainState
 
 
@@ -29,30 +31,32 @@ COMPILER_OPTIONS = {"xla_disable_hlo_passes": "cpu-parallel-task-assigner"}
 """XLA would divide single operations between CPU threads, which costs more than they take."""
 
 
-def make_trainer(
-    make_train: Callable[[ResolvedConfig], tuple[InitFn, TrainStep]],
-    capacity: int,
-    mesh: Mesh | None = None,
-) -> Trainer:
+def make_trainer(env: Env, capacity: int, mesh: Mesh | None = None) -> Trainer:
     """Compile once, run any number of iterations per call.
 
     Args:
-        make_train: returns `init` and `train_step`; traced leaves may change between calls.
+        env: the task.
         capacity: most iterations in one dispatch.
         mesh: the devices that share the work (`devices.make_mesh`); by default there is one.
+
+    Returns:
+        Programs whose configurations may change in their traced leaves between calls.
     """
+
+    def functions(config: ResolvedConfig) -> tuple[InitFn, TrainStep]:
+        return make_train(make_algorithm(config.algo, env, config), env, config)
 
     @partial(jax.jit, compiler_options=COMPILER_OPTIONS)
     @devices.shared_by(mesh)
     def init(config: ResolvedConfig, keys: jax.Array) -> TrainState:
         # one seed after the other: weights need QR decompositions, and XLA's CPU code for several
         # of them at once may wait for threads that wait for it (two seeds of 64 envs hang)
-        return over_seeds(make_train(config)[0], lambda f: partial(jax.lax.map, f))(keys)
+        return over_seeds(functions(config)[0], lambda f: partial(jax.lax.map, f))(keys)
 
     @partial(jax.jit, donate_argnums=1, compiler_options=COMPILER_OPTIONS)
     @devices.shared_by(mesh)
     def dispatch(config: ResolvedConfig, state: TrainState, count: ArrayLike):
-        step = jax.jit(over_seeds(make_train(config)[1]))  # jitted, to be traced once
+        step = jax.jit(over_seeds(functions(config)[1]))  # jitted, to be traced once
         shapes = jax.eval_shape(step, state)[1]
         rows = jax.tree.map(lambda x: jnp.zeros((capacity, *x.shape), x.dtype), shapes)
 

@@ -4,11 +4,11 @@ Leading axes: T time steps of a rollout, N parallel envs, B = T·N flattened sam
 A action dimensions.
 """
 
+from collections.abc import Callable
 from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 from jaxtyping import Array, Bool, Float, Int, Key
 
-from dgae_jax.maths.gaussian import Gaussian
 from dgae_jax.maths.returns import Quantiles, Steps
 
 Params = Any
@@ -82,25 +82,11 @@ class TrainState(NamedTuple):
     """Iterations in a row with a skipped update, or with most env steps masked."""
 
 
-@runtime_checkable
-class Init(Protocol):
-    """Initial parameters of a network."""
-
-    def __call__(self, key: Key[Array, ""]) -> Params: ...
-
-
-@runtime_checkable
-class ApplyPolicy(Protocol):
-    """Distribution over actions [..., A] in observations [..., O]."""
-
-    def __call__(self, params: Params, obs: Float[Array, "*steps O"]) -> Gaussian: ...
-
-
-@runtime_checkable
-class Predict(Protocol):
-    """Quantiles [..., K] of the return from observations [..., O]; K = 1 for a scalar critic."""
-
-    def __call__(self, params: Params, obs: Float[Array, "*steps O"]) -> Quantiles: ...
+Loss = Callable[[Params, Any], tuple[Float[Array, ""], Metrics]]
+"""`loss(params, batch)`: mean loss of a batch, and scalars worth logging."""
+Residual = Callable[[Steps, Steps, Quantiles, Quantiles], Steps]
+"""`residual(reward, discount, quantiles, next_quantiles)`: TD error δ from the predictions before
+and after each step; the part that DGAE changes."""
 
 
 @runtime_checkable
@@ -121,50 +107,21 @@ class TargetFn(Protocol):
     ) -> Float[Array, "*steps J"]: ...
 
 
-@runtime_checkable
-class Loss(Protocol):
-    """Mean loss of a batch, and scalars worth logging."""
+class Network(NamedTuple):
+    """A network."""
 
-    def __call__(self, params: Params, batch: Any) -> tuple[Float[Array, ""], Metrics]: ...
-
-
-@runtime_checkable
-class Residual(Protocol):
-    """TD error δ from the predictions before and after each step: the part that DGAE changes."""
-
-    def __call__(
-        self, reward: Steps, discount: Steps, quantiles: Quantiles, next_quantiles: Quantiles
-    ) -> Steps: ...
-
-
-@runtime_checkable
-class InitOptimizer(Protocol):
-    """State of an optimizer at the start."""
-
-    def __call__(self, params: Params) -> Any: ...
-
-
-@runtime_checkable
-class UpdateStep(Protocol):
-    """One iteration's update of a network, and scalars worth logging."""
-
-    def __call__(
-        self, key: Key[Array, ""], state: TrainableState, batch: Any
-    ) -> tuple[TrainableState, Metrics]: ...
-
-
-class Policy(NamedTuple):
-    """A policy network."""
-
-    init: Init
-    apply: ApplyPolicy
+    init: Callable[[Key[Array, ""]], Params]
+    """`init(key) -> params`."""
+    apply: Callable[[Params, Array], Any]
+    """`apply(params, obs [..., O])`; that of a policy returns a `Gaussian` of actions [..., A]."""
 
 
 class Critic(NamedTuple):
     """A value distribution: its prediction, the target of its fit, and the loss between them."""
 
-    init: Init
-    predict: Predict
+    init: Callable[[Key[Array, ""]], Params]
+    predict: Callable[[Params, Array], Quantiles]
+    """`predict(params, obs [..., O]) -> [..., K]`; K = 1 for a scalar critic."""
     target: TargetFn
     loss: Loss
     lam: float | None = None
@@ -174,14 +131,16 @@ class Critic(NamedTuple):
 class Update(NamedTuple):
     """Update of a network."""
 
-    init: InitOptimizer
-    step: UpdateStep
+    init: Callable[[Params], Any]
+    """`init(params) -> opt_state`."""
+    step: Callable[[Key[Array, ""], TrainableState, Any], tuple[TrainableState, Metrics]]
+    """`step(key, state, batch)`: the update of one iteration, and scalars worth logging."""
 
 
 class Algorithm(NamedTuple):
     """A policy-gradient algorithm; the six names of the paper are rows of `configs.algorithms`."""
 
-    policy: Policy
+    policy: Network
     critic: Critic
     residual: Residual
     policy_update: Update

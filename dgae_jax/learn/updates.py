@@ -10,11 +10,8 @@ import optax
 from jaxtyping import Array, ArrayLike
 
 from dgae_jax.learn import devices
-from dgae_jax.learn.types import Batch, Loss, Params, Policy, TrainableState, Update
+from dgae_jax.learn.types import Batch, Loss, Network, Params, TrainableState, Update
 from dgae_jax.maths import gaussian
-
-Optimizer = Callable[[Any], optax.GradientTransformation]
-"""`optimizer(learning rate or schedule)`."""
 
 LOG_RATIO_LIMIT = 20.0
 """Largest |log ρ|: a sample beyond it counts as one at the limit and has no gradient. PPO's clip
@@ -24,7 +21,7 @@ RADIUS_DECAY_START = 0.8
 """Share of a run after which max_kl decays: a decay from the start learns less on Walker2d."""
 
 
-def surrogate(policy: Policy, clip_eps: ArrayLike = jnp.inf) -> Loss:
+def surrogate(policy: Network, clip_eps: ArrayLike = jnp.inf) -> Loss:
     """Return the clipped surrogate loss −E[min(ρA, clip(ρ, 1 ± ε)A)] (Schulman et al. 2017).
 
     ρ = π(a|s)/π_old(a|s), bounded by `LOG_RATIO_LIMIT`. At the policy that acted the gradient is
@@ -49,24 +46,58 @@ def surrogate(policy: Policy, clip_eps: ArrayLike = jnp.inf) -> Loss:
     return loss
 
 
-def sgd(
-    loss: Loss, optimizer: optax.GradientTransformation, *, epochs: int, minibatches: int
+OPTIMIZERS: dict[str, Callable[[Any], optax.GradientTransformation]] = {
+    "adam": partial(optax.adam, eps=1e-5),  # Andrychowicz et al. 2021
+    "rmsprop": partial(optax.rmsprop, decay=0.99, eps=1e-5, eps_in_sqrt=False),  # as in sb3's A2C
+}
+"""`optimizer(learning rate or schedule)`."""
+
+
+def linear_schedule(
+    start: ArrayLike, end_fraction: ArrayLike, steps: ArrayLike, decay_start: float = 0.0
+) -> optax.Schedule:
+    """Return a schedule from `start` linearly to `end_fraction` of it, constant afterwards.
+
+    It lasts for `steps`, and the decay begins after the share `decay_start` of them.
+    """
+
+    def schedule(count: ArrayLike) -> Array:
+        done = jnp.clip((jnp.divide(count, steps) - decay_start) / (1 - decay_start), 0.0, 1.0)
+        return jnp.multiply(start, 1 + (end_fraction - 1) * done)
+
+    return schedule
+
+
+def minibatch_update(
+    loss: Loss,
+    iterations: ArrayLike,
+    *,
+    optimizer: str,
+    learning_rate: ArrayLike,
+    learning_rate_end: ArrayLike,
+    epochs: int,
+    minibatches: int,
+    max_grad_norm: ArrayLike,
 ) -> Update:
     """Return `epochs` passes over the shuffled batch, `minibatches` optimizer steps each.
 
-    A batch is any record of arrays [B, …] with `obs`. The info holds means over all steps.
+    A batch is any tree of arrays [B, …]. The info holds means over all steps. The learning rate
+    decays over a run of `iterations`; the options are the settings of the same names in
+    `configs.config.FitConfig`.
     """
+    steps = iterations * epochs * minibatches
+    schedule = linear_schedule(learning_rate, learning_rate_end, steps)
+    clip = optax.clip_by_global_norm(max_grad_norm)
+    rule = optax.chain(clip, OPTIMIZERS[optimizer](schedule))
 
     def minibatch_step(state: TrainableState, batch: Any):
         (value, info), gradient = jax.value_and_grad(loss, has_aux=True)(state.params, batch)
-        updates, opt_state = optimizer.update(gradient, state.opt_state, state.params)
+        updates, opt_state = rule.update(gradient, state.opt_state, state.params)
         info = {"loss": value, "gradient_norm": optax.global_norm(gradient), **info}
         return TrainableState(optax.apply_updates(state.params, updates), opt_state), info
 
     def step(key: jax.Array, state: TrainableState, batch: Any):
         size = len(jax.tree.leaves(batch)[0])
-        if size % minibatches:
-            raise ValueError(f"{size} samples do not divide into {minibatches} minibatches")
 
         def epoch(state: TrainableState, key: jax.Array):
             order = jax.random.permutation(key, size).reshape(minibatches, -1)
@@ -80,14 +111,22 @@ def sgd(
         state, infos = jax.lax.scan(epoch, state, jax.random.split(key, epochs))
         return state, jax.tree.map(jnp.mean, infos)
 
-    return Update(optimizer.init, step)
+    return Update(rule.init, step)
 
 
-def trust_region(
-    policy: Policy,
-    loss: Loss,
+def ppo_update(
+    policy: Network, iterations: ArrayLike, *, clip_eps: ArrayLike = jnp.inf, **fit
+) -> Update:
+    """Return minibatch gradient descent on the surrogate: PPO's, or A2C's without `clip_eps`."""
+    return minibatch_update(surrogate(policy, clip_eps), iterations, **fit)
+
+
+def trpo_update(
+    policy: Network,
+    iterations: ArrayLike,
     *,
-    max_kl: optax.Schedule,
+    max_kl: ArrayLike,
+    learning_rate_end: ArrayLike,
     damping: ArrayLike,
     cg_iterations: int,
     max_backtracks: int,
@@ -95,25 +134,35 @@ def trust_region(
 ) -> Update:
     """Return the natural gradient step of TRPO with a backtracking line search.
 
-    The direction solves (F + damping) x = −∇loss (Schulman et al. 2015). A step is accepted only if
-    KL(old ‖ new) ≤ `max_kl` and the loss falls; otherwise the parameters stay, bit for bit. As in
-    the paper of TRPO the divergence is summed over the A action dimensions. sb3-contrib averages
-    it: divide our max_kl and damping by A to get its values.
+    The direction solves (F + damping) x = −∇loss (Schulman et al. 2015), with F the Hessian of the
+    mean KL. A step is accepted only if KL(old ‖ new) ≤ `max_kl` and the loss falls; otherwise the
+    parameters stay, bit for bit. As in the paper of TRPO the divergence is summed over the A action
+    dimensions. sb3-contrib averages it: divide our max_kl and damping by A to get its values.
 
     Args:
         policy: the policy network.
-        loss: the surrogate.
-        max_kl: schedule, number of updates so far -> KL bound [nats].
+        iterations: those of the run.
+        max_kl: KL bound at the start of the run [nats].
+        learning_rate_end: the fraction of it at the end; see `RADIUS_DECAY_START`.
         damping: multiple of the identity added to the Fisher matrix F.
         cg_iterations: iterations of conjugate gradient.
         max_backtracks: times a step is halved before it is given up.
         fisher_every: F is estimated from every n-th sample.
     """
+    loss = surrogate(policy)
+    schedule = linear_schedule(max_kl, learning_rate_end, iterations, RADIUS_DECAY_START)
 
     def step(key: jax.Array, state: TrainableState, batch: Batch):
-        old, batch, bound = state.params, devices.divide(batch), max_kl(state.opt_state)
+        old, batch, bound = state.params, devices.divide(batch), schedule(state.opt_state)
         (start, info), gradient = jax.value_and_grad(loss, has_aux=True)(old, batch)
-        fisher = fisher_product(policy, old, batch.obs[::fisher_every], damping)
+        sample = batch.obs[::fisher_every]
+        here = policy.apply(old, sample)
+
+        def fisher(v: Params) -> Params:
+            """Return (F + damping) v, without forming F."""
+            slope = jax.grad(lambda p: gaussian.kl(here, policy.apply(p, sample)).mean())
+            return jax.tree.map(lambda f, v: f + damping * v, jax.jvp(slope, (old,), (v,))[1], v)
+
         descent = jax.tree.map(jnp.negative, gradient)
         direction, _ = jax.scipy.sparse.linalg.cg(fisher, descent, maxiter=cg_iterations, tol=1e-10)
         curvature = optax.tree.vdot(direction, fisher(direction))
@@ -152,85 +201,9 @@ def trust_region(
     return Update(lambda params: jnp.int32(0), step)
 
 
-def fisher_product(
-    policy: Policy, params: Params, obs: Array, damping: ArrayLike
-) -> Callable[[Params], Params]:
-    """Return v ↦ (F + damping) v, F the Hessian of the mean KL at `params`, never formed."""
-    here = policy.apply(params, obs)
-
-    def slope(params: Params) -> Params:
-        return jax.grad(lambda p: gaussian.kl(here, policy.apply(p, obs)).mean())(params)
-
-    def product(v: Params) -> Params:
-        return jax.tree.map(lambda f, v: f + damping * v, jax.jvp(slope, (params,), (v,))[1], v)
-
-    return product
-
-
-OPTIMIZERS: dict[str, Optimizer] = {
-    "adam": partial(optax.adam, eps=1e-5),  # Andrychowicz et al. 2021
-    "rmsprop": partial(optax.rmsprop, decay=0.99, eps=1e-5, eps_in_sqrt=False),  # as in sb3's A2C
-}
-
-
-def linear_schedule(
-    start: ArrayLike, end_fraction: ArrayLike, steps: ArrayLike, decay_start: float = 0.0
-) -> optax.Schedule:
-    """Return a schedule from `start` linearly to `end_fraction` of it, constant afterwards.
-
-    It lasts for `steps`, and the decay begins after the share `decay_start` of them.
-    """
-
-    def schedule(count: ArrayLike) -> Array:
-        done = jnp.clip((jnp.divide(count, steps) - decay_start) / (1 - decay_start), 0.0, 1.0)
-        return jnp.multiply(start, 1 + (end_fraction - 1) * done)
-
-    return schedule
-
-
-def minibatch_update(
-    loss: Loss,
-    iterations: ArrayLike,
-    *,
-    optimizer: str,
-    learning_rate: ArrayLike,
-    learning_rate_end: ArrayLike,
-    epochs: int,
-    minibatches: int,
-    max_grad_norm: ArrayLike,
-) -> Update:
-    """Return `sgd` on a loss, with a learning rate that decays over a run of `iterations`.
-
-    The options are the settings of the same names in `configs.config.FitConfig`.
-    """
-    steps = iterations * epochs * minibatches
-    schedule = linear_schedule(learning_rate, learning_rate_end, steps)
-    clip = optax.clip_by_global_norm(max_grad_norm)
-    rule = optax.chain(clip, OPTIMIZERS[optimizer](schedule))
-    return sgd(loss, rule, epochs=epochs, minibatches=minibatches)
-
-
-def ppo_update(policy: Policy, iterations: ArrayLike, *, clip_eps: ArrayLike, **fit) -> Update:
-    """PPO: minibatch gradient descent on the clipped surrogate."""
-    return minibatch_update(surrogate(policy, clip_eps), iterations, **fit)
-
-
-def a2c_update(policy: Policy, iterations: ArrayLike, **fit) -> Update:
-    """A2C: minibatch gradient descent on the surrogate without a clip."""
-    return minibatch_update(surrogate(policy), iterations, **fit)
-
-
-def trpo_update(
-    policy: Policy, iterations: ArrayLike, *, max_kl: ArrayLike, learning_rate_end, **search
-) -> Update:
-    """TRPO: a natural gradient step on the surrogate; max_kl decays at the end of the run."""
-    schedule = linear_schedule(max_kl, learning_rate_end, iterations, RADIUS_DECAY_START)
-    return trust_region(policy, surrogate(policy), max_kl=schedule, **search)
-
-
 UPDATES: dict[str, Callable[..., Update]] = {
     "clip": ppo_update,
-    "gradient": a2c_update,
+    "gradient": ppo_update,
     "trust-region": trpo_update,
 }
 """`update(policy, iterations, **options)`."""

@@ -13,7 +13,7 @@ from dgae_jax.configs.config import CriticConfig, invalid
 from dgae_jax.configs.resolved import ResolvedConfig, resolve
 from dgae_jax.learn.build import make_quantiles, make_task
 from dgae_jax.learn.diagnostics import SIMILAR, similar_means
-from dgae_jax.learn.networks import value_network
+from dgae_jax.learn.networks import Value, network
 from dgae_jax.learn.normalizers import normalize
 from dgae_jax.learn.types import InferenceState, Params, TrainableState
 from dgae_jax.learn.updates import minibatch_update
@@ -199,8 +199,8 @@ def refit(
     critic = CriticConfig(kind="sorted", hidden=config.critic.hidden, **kept)
     one = {"seed": config.seed + index, "num_seeds": 1}
     config = resolve(written.replace(**one, normalize_rewards=True, critic=critic))
-    network = config.critic.outputs, config.critic.hidden
-    params = fit_quantiles(samples, *network, len(came.returns), fit_key, watch)
+    layers = config.critic.outputs, config.critic.hidden
+    params = fit_quantiles(samples, *layers, len(came.returns), fit_key, watch)
     states = policy, InferenceState(params, policy.obs_stats)
     policy, critic = jax.tree.map(lambda x: x[None], states)
     return config, Networks(policy, critic, found.path), std[None]
@@ -221,11 +221,11 @@ def fit_quantiles(
     """
     obs, returns = samples
     bias = jnp.quantile(returns, quantile_midpoints(outputs))  # returns may be far from 0
-    network = value_network(obs.shape[-1], outputs, hidden=hidden, bias=bias)
+    values = network(Value(hidden, outputs, bias=bias), obs.shape[-1])
 
     def loss(params: Params, batch: Any):
         obs, returns = batch
-        quantiles = network.apply(params, obs)
+        quantiles = values.apply(params, obs)
         value = quantile_huber_loss(quantiles, returns[:, None], kappa=KAPPA) / KAPPA
         return value.mean(), {}
 
@@ -233,7 +233,7 @@ def fit_quantiles(
     how: dict[str, Any] = {"optimizer": "adam", **rates, "epochs": 1, "minibatches": minibatches}
     update = minibatch_update(loss, PASSES, **how)
     begin, *keys = jax.random.split(key, 1 + PASSES)
-    params = network.init(begin)
+    params = values.init(begin)
     state = TrainableState(params, update.init(params))
     step = jax.jit(jax.default_matmul_precision("highest")(update.step))
     compile_in_thread(step, keys[0], state, samples, watch=watch)

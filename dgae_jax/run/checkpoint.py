@@ -21,7 +21,8 @@ from jaxtyping import ArrayLike
 from dgae_jax.configs.config import ConfigError, invalid
 from dgae_jax.configs.resolved import ResolvedConfig, resolve
 from dgae_jax.configs.serial import MAY_CHANGE, differences, from_dict, to_dict
-from dgae_jax.learn.build import make_task, make_trainer, seed_keys
+from dgae_jax.learn.build import make_task, seed_keys
+from dgae_jax.learn.parallel import make_trainer
 from dgae_jax.learn.types import InferenceState, TrainState
 from dgae_jax.run import files, runtime, terminal
 from dgae_jax.run.metrics import EvaluationsFile

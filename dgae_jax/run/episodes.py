@@ -14,9 +14,9 @@ from jaxtyping import Bool, Float
 
 from dgae_jax.configs.resolved import ResolvedConfig
 from dgae_jax.envs.registry import CUSTOM_ENVS, spec_of
-from dgae_jax.learn.build import make_greedy, make_policy, make_task, make_trainer
+from dgae_jax.learn.build import make_greedy, make_policy, make_task
 from dgae_jax.learn.iteration import sampler
-from dgae_jax.learn.parallel import Trainer
+from dgae_jax.learn.parallel import Trainer, make_trainer
 from dgae_jax.learn.rollout import Episodes, rollout, start
 from dgae_jax.learn.types import InferenceState, Transition
 from dgae_jax.run.options import eval_env_id

@@ -16,9 +16,10 @@ from dgae_jax.configs.config import ConfigError, invalid
 from dgae_jax.configs.resolved import ResolvedConfig
 from dgae_jax.configs.serial import MAY_CHANGE, differences
 from dgae_jax.envs.registry import spec_of
-from dgae_jax.learn.build import make_task, make_trainer, seed_keys
+from dgae_jax.learn.build import make_task, seed_keys
 from dgae_jax.learn.devices import make_mesh
 from dgae_jax.learn.memory import check_memory
+from dgae_jax.learn.parallel import make_trainer
 from dgae_jax.learn.types import TrainState
 from dgae_jax.run import checkpoint, directory, files, runtime, terminal
 from dgae_jax.run.checkpoint import NotFiniteError

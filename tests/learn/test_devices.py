@@ -11,7 +11,8 @@ from numpy.testing import assert_allclose
 
 import dgae_jax as dg
 from dgae_jax.learn import devices
-from dgae_jax.learn.build import make_trainer, seed_keys
+from dgae_jax.learn.build import seed_keys
+from dgae_jax.learn.parallel import make_trainer
 from tests.helpers import ROOT, small
 
 

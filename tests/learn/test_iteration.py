@@ -9,7 +9,8 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 import dgae_jax as dg
 from dgae_jax.configs.algorithms import ALGORITHMS
-from dgae_jax.learn.build import make_greedy, make_trainer, policies_of, seed_keys
+from dgae_jax.learn.build import make_greedy, policies_of, seed_keys
+from dgae_jax.learn.parallel import make_trainer
 from dgae_jax.learn.types import Update
 from tests.helpers import distance, small
 from tests.probes import Constant, Counter, Fragile, Target

@@ -7,15 +7,15 @@ import pytest
 from numpy.testing import assert_allclose
 
 from dgae_jax.learn.critics import TARGETS, quantile_critic
-from dgae_jax.learn.networks import SharedCovariance, StateCovariance, gaussian_policy
+from dgae_jax.learn.networks import SharedCovariance, StateCovariance, network
 from dgae_jax.learn.types import TrainableState
-from dgae_jax.learn.updates import linear_schedule, minibatch_update, sgd, surrogate
+from dgae_jax.learn.updates import OPTIMIZERS, linear_schedule, minibatch_update, surrogate
 from dgae_jax.maths import gaussian
 from tests.helpers import distance
 from tests.learn.batches import make_batch
 
 SIZE = 24
-POLICY = gaussian_policy(3, 2, hidden=(8,), covariance=SharedCovariance, initial_std=1.0)
+POLICY = network(SharedCovariance((8,), 2, 1.0), 3)
 PARAMS = POLICY.init(jax.random.key(0))
 
 
@@ -87,17 +87,21 @@ def test_a_masked_sample_has_no_weight_in_policy_and_critic(batch):
     assert surrogate(POLICY)(PARAMS, broken)[1]["kl"] == 0
 
 
-def fitted(loss, optimizer, params, batch, epochs, minibatches):
-    update = sgd(loss, optimizer, epochs=epochs, minibatches=minibatches)
-    return update.step(jax.random.key(0), TrainableState(params, update.init(params)), batch)
+RATE = {"learning_rate": 1.0, "learning_rate_end": 1.0}
 
 
 @pytest.mark.parametrize(("epochs", "minibatches"), [(1, 4), (3, 8)])
-def test_an_epoch_visits_every_sample_once(epochs, minibatches, batch):
+def test_an_epoch_visits_every_sample_once(epochs, minibatches, batch, monkeypatch):
+    monkeypatch.setitem(OPTIMIZERS, "sgd", optax.sgd)
+
     def loss(params, batch):  # each sample's gradient is 1
         return (params - batch.reward).sum(), {}
 
-    state, info = fitted(loss, optax.sgd(1.0), jnp.zeros(()), batch, epochs, minibatches)
+    passes = {"epochs": epochs, "minibatches": minibatches, "max_grad_norm": jnp.inf}
+    update = minibatch_update(loss, 1, optimizer="sgd", **RATE, **passes)
+    params = jnp.zeros(())
+    before = TrainableState(params, update.init(params))
+    state, info = update.step(jax.random.key(0), before, batch)
     assert_allclose(state.params, -float(SIZE) * epochs)
     assert_allclose(info["gradient_norm"], SIZE / minibatches)
 
@@ -111,9 +115,8 @@ def test_schedules_decay_linearly_to_their_end():
 
 
 def test_the_global_norm_of_a_gradient_is_bounded(batch):
-    fit = {"optimizer": "adam", "learning_rate": 1.0, "learning_rate_end": 1.0}
-    passes = {"epochs": 1, "minibatches": 1, "max_grad_norm": 1.0}
-    update = minibatch_update(lambda p, _: (3 * p["a"] + 4 * p["b"], {}), 1, **fit, **passes)
+    fit = {"optimizer": "adam", "epochs": 1, "minibatches": 1, "max_grad_norm": 1.0}
+    update = minibatch_update(lambda p, _: (3 * p["a"] + 4 * p["b"], {}), 1, **fit, **RATE)
     params = {"a": jnp.zeros(()), "b": jnp.zeros(())}
     state, _ = update.step(jax.random.key(0), TrainableState(params, update.init(params)), batch)
     assert_allclose(optax.tree_utils.tree_get(state.opt_state, "mu")["b"], 0.1 * 0.8, rtol=1e-6)
@@ -124,7 +127,7 @@ def test_the_global_norm_of_a_gradient_is_bounded(batch):
 
 @pytest.mark.parametrize("covariance", [SharedCovariance, StateCovariance])
 def test_first_actions_are_wide_noise_around_zero(covariance, key):
-    policy = gaussian_policy(3, 2, hidden=(16, 16), covariance=covariance, initial_std=0.7)
+    policy = network(covariance((16, 16), 2, 0.7), 3)
     mean, log_std = policy.apply(policy.init(key), jax.random.normal(key, (5, 4, 3)))
     assert mean.shape == log_std.shape == (5, 4, 2)
     assert float(jnp.abs(mean).max()) < 0.05

@@ -5,7 +5,8 @@ from functools import cache
 
 import pytest
 
-from dgae_jax.learn.build import make_task, make_trainer, seed_keys
+from dgae_jax.learn.build import make_task, seed_keys
+from dgae_jax.learn.parallel import make_trainer
 from dgae_jax.run import training
 from tests.runs import SMALL, exit_code, small
 

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from dgae_jax.configs.config import ConfigError, NoiseConfig
-from dgae_jax.learn.build import make_task, make_trainer, policies_of, seed_keys
+from dgae_jax.learn.build import make_task, policies_of, seed_keys
+from dgae_jax.learn.parallel import make_trainer
 from dgae_jax.run import episodes
 from dgae_jax.run.evaluation import (
     describe,
