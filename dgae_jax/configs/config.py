@@ -4,6 +4,7 @@ A setting that is None is unset; `configs.resolved.resolve` fills it in.
 """
 
 import dataclasses
+from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
 from operator import attrgetter
 from typing import Any, Literal, Self
@@ -28,6 +29,15 @@ def invalid(setting: str, value: Any, allowed: str) -> ConfigError:
     """Return the error that says what a setting must be."""
     shown = " ".join(map(str, value)) or "()" if isinstance(value, tuple) else value
     return ConfigError(f"{setting} {shown}: must be {allowed}", setting)
+
+
+def flat(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Return the settings of plain data by their dotted paths."""
+    out: dict[str, Any] = {}
+    for name, value in values.items():
+        path = prefix + name
+        out |= flat(value, f"{path}.") if isinstance(value, dict) else {path: value}
+    return out
 
 
 class Settings:

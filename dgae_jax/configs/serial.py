@@ -4,9 +4,9 @@ import dataclasses
 import hashlib
 import json
 from collections.abc import Mapping
-from typing import Any, get_type_hints
+from typing import Any
 
-from dgae_jax.configs.config import Config, ConfigError
+from dgae_jax.configs.config import Config, ConfigError, flat
 from dgae_jax.configs.resolved import ResolvedConfig
 from dgae_jax.configs.validation import check_types
 
@@ -42,7 +42,10 @@ def from_dict(data: Any) -> Config:
     Raises:
         ConfigError: for an unknown schema, missing or unknown names and wrong types.
     """
-    config = _built(Config, upgraded(data), "")
+    values, default = flat(upgraded(data)), Config()
+    for path in sorted(set(values) ^ set(flat(dataclasses.asdict(default)))):
+        raise ConfigError(f"{path}: {'unknown' if path in values else 'missing'}")
+    config = default.replace(**values)
     check_types(config)
     return config
 
@@ -78,29 +81,7 @@ def digest(config: AnyConfig) -> str:
     return hashlib.sha256(json.dumps(plain, sort_keys=True).encode()).hexdigest()[:12]
 
 
-def flat(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
-    """Return the settings of plain data by their dotted paths."""
-    out: dict[str, Any] = {}
-    for name, value in values.items():
-        path = prefix + name
-        out |= flat(value, f"{path}.") if isinstance(value, dict) else {path: value}
-    return out
-
-
 def differences(one: AnyConfig, two: AnyConfig) -> dict[str, tuple[Any, Any]]:
     """Return both values of every setting, by path, in which two configurations differ."""
     ours, theirs = flat(to_dict(one)), flat(to_dict(two))
     return {path: (x, theirs[path]) for path, x in ours.items() if x != theirs[path]}
-
-
-def _built(cls: type, data: Any, prefix: str) -> Any:
-    if not isinstance(data, dict):
-        raise ConfigError(f"{prefix.rstrip('.')}: must be an object, not {data!r}")
-    kinds = get_type_hints(cls)
-    for name in sorted(set(data) ^ set(kinds)):
-        raise ConfigError(f"{prefix}{name}: {'unknown' if name in data else 'missing'}")
-    values = dict(data)
-    for name, kind in kinds.items():
-        if dataclasses.is_dataclass(kind):
-            values[name] = _built(kind, data[name], f"{prefix}{name}.")  # pyright: ignore
-    return cls(**values)

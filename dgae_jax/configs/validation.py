@@ -4,12 +4,12 @@ Values that are traced by JAX are not known yet and pass unchecked.
 """
 
 import dataclasses
-import math
+import sys
 from collections.abc import Callable, Mapping
 from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 from dgae_jax.configs import parts
-from dgae_jax.configs.config import Config, ConfigError, Settings, invalid
+from dgae_jax.configs.config import Config, ConfigError, Settings, flat, invalid
 from dgae_jax.envs.registry import EnvSpec, spec_of
 from dgae_jax.maths import risk
 from dgae_jax.physics.registry import ENGINES, require
@@ -25,8 +25,8 @@ def _whole(low: int, high: int, reason: str) -> tuple[int, int, str]:
 
 UNIT = 0, 1, "a number from 0 to 1"
 POSITIVE = 1e-30, 1e30, "a number above 0, from 1e-30 to 1e30"
+STD = 0, sys.float_info.max, "a finite number of at least 0"
 SAMPLES = _whole(1, INT32_MAX, "samples are indexed by an int32")
-EPOCHS = _whole(1, 10_000, "more passes over one rollout only fit its noise")
 
 RANGES: dict[str, tuple[float, float, str]] = {
     "num_seeds": _whole(1, 4096, "every one is a whole run in the same program"),
@@ -36,36 +36,34 @@ RANGES: dict[str, tuple[float, float, str]] = {
     "episode_length": _whole(1, INT32_MAX, "steps are counted in an int32"),
     "gamma": UNIT,
     "gae_lambda": UNIT,
-    "policy.initial_std": POSITIVE,
-    "policy.learning_rate": POSITIVE,
-    "policy.learning_rate_end": UNIT,
-    "policy.epochs": EPOCHS,
-    "policy.minibatches": SAMPLES,
-    "policy.max_grad_norm": POSITIVE,
-    "policy.clip_eps": POSITIVE,
-    "policy.max_kl": POSITIVE,
-    "policy.damping": POSITIVE,
-    "policy.cg_iterations": _whole(1, 1000, "float32 directions are not conjugate beyond"),
-    "policy.max_backtracks": _whole(0, 100, "a step halved more often is 0 in float32"),
-    "policy.fisher_every": SAMPLES,
-    "critic.learning_rate": POSITIVE,
-    "critic.learning_rate_end": UNIT,
-    "critic.epochs": EPOCHS,
-    "critic.minibatches": SAMPLES,
-    "critic.max_grad_norm": POSITIVE,
-    "critic.quantiles": _whole(1, 10_000, "their residuals are K × K for every sample"),
-    "critic.kappa": POSITIVE,
+    "initial_std": POSITIVE,
+    "learning_rate": POSITIVE,
+    "learning_rate_end": UNIT,
+    "epochs": _whole(1, 10_000, "more passes over one rollout only fit its noise"),
+    "minibatches": SAMPLES,
+    "max_grad_norm": POSITIVE,
+    "clip_eps": POSITIVE,
+    "max_kl": POSITIVE,
+    "damping": POSITIVE,
+    "cg_iterations": _whole(1, 1000, "float32 directions are not conjugate beyond"),
+    "max_backtracks": _whole(0, 100, "a step halved more often is 0 in float32"),
+    "fisher_every": SAMPLES,
+    "quantiles": _whole(1, 10_000, "their residuals are K × K for every sample"),
+    "kappa": POSITIVE,
+    "reward": STD,
+    "action": STD,
+    "observation": STD,
+    "initial": STD,
 }
-"""Lowest and highest value of a number, and how an error message says so."""
+"""By name of a number: its lowest and highest value, and how an error message says so."""
 
 CHOICES = {
-    "policy.covariance": parts.COVARIANCES,
-    "policy.optimizer": parts.OPTIMIZERS,
-    "critic.optimizer": parts.OPTIMIZERS,
-    "critic.target": parts.TARGETS,
+    "covariance": parts.COVARIANCES,
+    "optimizer": parts.OPTIMIZERS,
+    "target": parts.TARGETS,
     "residual": parts.RESIDUALS,
 }
-"""Names, and the table that each must be in."""
+"""By name of a setting: the table that its value must be in."""
 
 
 def lookup(setting: str, name: Any, table: Mapping[str, Any]) -> Any:
@@ -126,10 +124,13 @@ def check_unused(
 def check(config: Config, spec: EnvSpec) -> None:
     """Raise ConfigError for the first invalid setting of a configuration that is filled in."""
     _check_task(config, spec)
-    for path, (low, high, allowed) in RANGES.items():
-        _require(config, path, lambda x: low <= x <= high, allowed)  # noqa: B023  called at once
-    for path, table in CHOICES.items():
-        _require(config, path, table.__contains__, f"one of {', '.join(table)}")
+    for path in flat(dataclasses.asdict(config)):
+        name = path.rpartition(".")[2]
+        if name in RANGES:
+            low, high, allowed = RANGES[name]
+            _require(config, path, lambda x: low <= x <= high, allowed)  # noqa: B023  called at once
+        if name in CHOICES:
+            _require(config, path, CHOICES[name].__contains__, f"one of {', '.join(CHOICES[name])}")
     highest = 2**32 - config.num_seeds
     allowed = f"a whole number from 0 to {highest:,} (seeds are numbers of 32 bits)"
     _require(config, "seed", lambda seed: 0 <= seed <= highest, allowed)
@@ -158,9 +159,6 @@ def _check_task(config: Config, spec: EnvSpec) -> None:
         only = f"unset with {config.env}"
         _require(config, "env_version", lambda version: False, only)
         _require(config, "noise.initial", lambda std: std == 0, only)
-    for name in vars(config.noise):
-        allowed = "a finite number of at least 0"
-        _require(config, f"noise.{name}", lambda std: 0 <= std < math.inf, allowed)
 
 
 def _check_networks(config: Config) -> None:

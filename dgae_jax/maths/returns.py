@@ -11,8 +11,6 @@ trace. The functions share these arguments, where T are time steps and K quantil
     trace: λ(1 − done) [T, ...], so that γλ(1 − done) = discount · trace.
 """
 
-from typing import NamedTuple
-
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Bool, Float, Key, Shaped
@@ -24,20 +22,13 @@ Quantiles = Float[Array, "*steps K"]
 Mask = Bool[Array, "*steps"] | Steps
 
 
-class Decay(NamedTuple):
-    """Factors of the bootstrap, γ(1 − terminated), and of the trace, λ(1 − done)."""
-
-    discount: Steps
-    trace: Steps
-
-
-def decay(terminated: Mask, truncated: Mask, *, gamma: ArrayLike, lam: ArrayLike) -> Decay:
-    """Return the two factors of the estimators below, for γ and λ from 0 to 1."""
+def decay(
+    terminated: Mask, truncated: Mask, *, gamma: ArrayLike, lam: ArrayLike
+) -> tuple[Steps, Steps]:
+    """Return `discount` and `trace` of the estimators below, for γ and λ from 0 to 1."""
     done = jnp.logical_or(terminated, truncated)
-    return Decay(
-        jnp.multiply(gamma, 1.0 - jnp.asarray(terminated, float)),
-        jnp.multiply(lam, 1.0 - jnp.asarray(done, float)),
-    )
+    discount = jnp.multiply(gamma, 1.0 - jnp.asarray(terminated, float))
+    return discount, jnp.multiply(lam, 1.0 - jnp.asarray(done, float))
 
 
 def lambda_sum(delta: Steps, factor: Steps) -> Steps:

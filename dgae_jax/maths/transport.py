@@ -84,12 +84,6 @@ def wasserstein(u: Quantiles, v: Quantiles, p: float = 1) -> Float[Array, "*batc
     return (jnp.abs(jnp.sort(u) - jnp.sort(v)) ** p).mean(-1) ** (1 / p)
 
 
-def huber(u: Array, kappa: ArrayLike) -> tuple[Array, Array]:
-    """Compute L_κ(u) = ½u² for |u| ≤ κ, else κ(|u| − ½κ), and its slope, the clipped u."""
-    slope = jnp.clip(u, jnp.negative(kappa), kappa)
-    return slope * (u - 0.5 * slope), slope
-
-
 def quantile_huber_loss(
     quantiles: Quantiles,
     target: Float[Array, "*#batch J"],
@@ -119,15 +113,16 @@ def _quantile_huber(quantiles: Array, target: Array, kappa: Array) -> Array:
 def _loss_and_slopes(quantiles: Array, target: Array, kappa: Array):
     """Compute the loss, and its derivatives by quantiles and targets.
 
-    A CPU takes one target after the other: storing the K × J errors of a sample costs several times
-    more than computing them. An accelerator computes all at once: there each loop iteration costs a
-    kernel launch.
+    L_κ(u) is slope · (u − ½ slope), and its slope is u clipped to ±κ. A CPU takes one target after
+    the other: storing the K × J errors of a sample costs several times more than computing them. An
+    accelerator computes all at once: there each loop iteration costs a kernel launch.
     """
     tau, count = quantile_midpoints(quantiles.shape[-1]), target.shape[-1]
 
-    def weighted(error: Array, tau: Array) -> list[Array]:
+    def weighted(error: Array, tau: Array) -> tuple[Array, Array]:
         weight = jnp.where(error < 0, 1 - tau, tau)
-        return [weight * x for x in huber(error, kappa)]
+        slope = jnp.clip(error, jnp.negative(kappa), kappa)
+        return weight * (slope * (error - 0.5 * slope)), weight * slope
 
     def on_cpu(quantiles: Array, target: Array):
         def add(sums: tuple[Array, Array], target: Array):

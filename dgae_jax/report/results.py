@@ -9,8 +9,8 @@ from typing import Any, NamedTuple, get_args, get_type_hints
 import numpy as np
 
 from dgae_jax.configs.algorithms import ALGORITHMS
-from dgae_jax.configs.config import ConfigError
-from dgae_jax.configs.serial import flat, upgraded
+from dgae_jax.configs.config import ConfigError, flat
+from dgae_jax.configs.serial import upgraded
 from dgae_jax.run import files, terminal
 
 RESULTS = "results.jsonl"

@@ -14,8 +14,9 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
+from dgae_jax.configs.config import flat
 from dgae_jax.configs.resolved import ResolvedConfig
-from dgae_jax.configs.serial import flat, to_dict
+from dgae_jax.configs.serial import to_dict
 from dgae_jax.run import files, metrics, terminal
 
 Rows = list[tuple[int, dict[str, float]]]

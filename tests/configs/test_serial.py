@@ -73,7 +73,7 @@ def test_differences_name_the_settings_and_both_values():
         (lambda d: d.update(horizon=1), "horizon: unknown"),
         (lambda d: d.update(num_envs="16"), "num_envs: must be int"),
         (lambda d: d.update(num_envs=True), "num_envs: must be int"),
-        (lambda d: d.update(policy=3), "policy: must be an object"),
+        (lambda d: d.update(policy=3), "policy: unknown"),
         (lambda d: d["critic"].update(hidden="64"), "critic.hidden: must be tuple"),
         (lambda d: d["critic"].update(kapa=1), "critic.kapa: unknown"),
     ],

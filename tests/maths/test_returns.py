@@ -99,7 +99,7 @@ def test_lambda_shift_has_the_lambda_mean_and_one_step_shape(key):
     mean = z.mean(-1) + dg.gae(reward, z.mean(-1), z_next.mean(-1), *ends, gamma=GAMMA, lam=LAM)
     assert_allclose(dg.lambda_return(reward, *d, z, z_next), mean, atol=1e-6)
     got = dg.lambda_shift_target(reward, *d, z, z_next)
-    one_step = dg.bellman_target(reward, d.discount, z_next)
+    one_step = dg.bellman_target(reward, d[0], z_next)
     assert_allclose(got.mean(-1), mean, atol=1e-5)
     shapes = (x - x.mean(-1, keepdims=True) for x in (got, one_step))
     assert_allclose(*shapes, atol=1e-5)
@@ -108,11 +108,11 @@ def test_lambda_shift_has_the_lambda_mean_and_one_step_shape(key):
 @pytest.mark.parametrize("lam", [0.0, 1.0])
 def test_sr_lambda_zero_is_one_step_and_one_the_end_of_the_trace(lam, key):
     reward, _, z_next, *ends = trajectory(key)
-    d = decay(*ends, gamma=GAMMA, lam=lam)
-    got, later = dg.sr_lambda_target(key, reward, *d, z_next), z_next[-1]
+    discount, trace = decay(*ends, gamma=GAMMA, lam=lam)
+    got, later = dg.sr_lambda_target(key, reward, discount, trace, z_next), z_next[-1]
     for t in reversed(range(12)):
-        later = jnp.where(d.trace[t][:, None] > 0, later, z_next[t])
-        later = dg.bellman_target(reward[t], d.discount[t], later)
+        later = jnp.where(trace[t][:, None] > 0, later, z_next[t])
+        later = dg.bellman_target(reward[t], discount[t], later)
         assert_allclose(got[t], later, atol=1e-5)
 
 
