@@ -1,6 +1,6 @@
 """The examples compute what the package computes."""
 
-import ast
+import re
 import runpy
 
 import jax
@@ -56,11 +56,5 @@ def test_dppo_computes_what_the_package_computes(example):
 
 
 def test_dppo_needs_nothing_of_the_trainer():
-    imports = [
-        node.module if isinstance(node, ast.ImportFrom) else alias.name
-        for node in ast.walk(ast.parse(DPPO.read_text()))
-        if isinstance(node, ast.Import | ast.ImportFrom)
-        for alias in node.names
-    ]
-    rooms = {name.split(".")[1] for name in imports if name.startswith("dgae_jax.")}
+    rooms = set(re.findall(r"^(?:from|import) dgae_jax\.(\w+)", DPPO.read_text(), re.MULTILINE))
     assert rooms == {"maths"}

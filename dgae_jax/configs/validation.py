@@ -162,11 +162,10 @@ def _check_task(config: Config, spec: EnvSpec) -> None:
 
 
 def _check_networks(config: Config) -> None:
-    width = f"widths of at most {MAX_WIDTH:,} (one layer of them has 17 GB of weights)"
+    widths = f"one or more widths from 1 to {MAX_WIDTH:,} (one layer of such has 17 GB of weights)"
     layers = f"at most {MAX_LAYERS} (XLA compiles a thousand for half an hour)"
     for path in ("policy.hidden", "critic.hidden"):
-        _require(config, path, lambda x: min(x, default=0) >= 1, "one or more widths of at least 1")
-        _require(config, path, lambda x: max(x) <= MAX_WIDTH, width)
+        _require(config, path, lambda x: x and 1 <= min(x) <= max(x) <= MAX_WIDTH, widths)
         if (count := len(config.get(path))) > MAX_LAYERS:
             raise ConfigError(f"{path} of {count:,} layers: must be {layers}", path)
 

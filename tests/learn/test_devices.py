@@ -42,12 +42,6 @@ def test_shared_runs_are_those_of_one_device_up_to_rounding(shared, single, foun
         assert np.abs(found[single] - found["dppo start"]).max() > 1e-3
 
 
-def test_a_single_device_shares_nothing():
-    assert devices.make_mesh(1) is None
-    assert devices.count() == 1
-    assert devices.divided(len, (0,), None) is len
-
-
 def trained(algo, seeds, count, iterations=10):
     """Parameters after ten iterations and their rewards, on so many devices."""
     config = dg.resolve(small(algo, num_envs=8, num_steps=16, num_seeds=seeds))

@@ -22,14 +22,10 @@ def test_pit_counts_quantiles_at_or_below_the_outcome():
     assert_allclose(dg.pit(quantiles, jnp.array([0.0, 2.0, 9.0])), [0.0, 0.5, 1.0])
 
 
-def test_true_distribution_has_uniform_pit_and_nominal_coverage(key):
+def test_true_distribution_has_uniform_pit(key):
     z = jnp.asarray(scipy.stats.norm.ppf(dg.quantile_midpoints(64)), jnp.float32)
-    y = jax.random.normal(key, (20_000,))
-    z = jnp.broadcast_to(z, (20_000, 64))
-    assert_allclose(np.histogram(dg.pit(z, y), 8, (0, 1))[0] / 20_000, 1 / 8, atol=0.02)
-    assert_allclose(dg.coverage(z, y, 0.9), 0.9, atol=0.015)
-    half = 2 * scipy.stats.norm.cdf(0.5 * 1.6449) - 1
-    assert_allclose(dg.coverage(0.5 * z, y, 0.9), half, atol=0.015)
+    pit = dg.pit(jnp.broadcast_to(z, (20_000, 64)), jax.random.normal(key, (20_000,)))
+    assert_allclose(np.histogram(pit, 8, (0, 1))[0] / 20_000, 1 / 8, atol=0.02)
 
 
 @pytest.mark.parametrize("of", [scipy.stats.uniform, scipy.stats.norm])
@@ -65,13 +61,6 @@ def test_interquartile_mean_leaves_out_a_quarter_at_each_end(scores, mean):
 def test_interval_of_two_samples_lies_between_them():
     # a quarter of the draws is twice the lower sample, a quarter twice the higher one
     assert_array_equal(dg.bootstrap_interval(np.array([1.0, 3.0])), [1, 3])
-
-
-def test_strata_keep_their_sizes_in_each_draw():
-    strata = [np.zeros(3), np.ones(3)]
-    assert_array_equal(dg.bootstrap_interval(strata), [0.5, 0.5])
-    low, high = dg.bootstrap_interval(np.concatenate(strata))
-    assert low < 0.25 < 0.75 < high
 
 
 def _pooled(*tasks, axis):

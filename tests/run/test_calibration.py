@@ -9,7 +9,7 @@ import pytest
 
 import dgae_jax as dg
 from dgae_jax.configs.config import ConfigError
-from dgae_jax.learn.networks import value_network
+from dgae_jax.learn.networks import Value
 from dgae_jax.maths.transport import quantile_midpoints
 from dgae_jax.run import calibration, checkpoint, directory, episodes, training
 from tests.runs import QUIET, small
@@ -70,7 +70,7 @@ def test_fit_finds_quantiles(returns, expected):
     obs = jnp.where(which < 0.5, -1.0, 1.0)
     samples = obs[:, None], returns(obs, luck)
     params = calibration.fit_quantiles(samples, 16, (32,), 200, jax.random.key(2))
-    found = value_network(1, 16, hidden=(32,)).apply(params, jnp.array([[-1.0], [1.0]]))
+    found = Value((32,), 16).apply(params, jnp.array([[-1.0], [1.0]]))
     np.testing.assert_allclose(found, expected, atol=0.15)
 
 
