@@ -77,16 +77,12 @@ def over_seeds(f: Callable, many: Callable[[Callable], Callable] = jax.vmap) -> 
     """
 
     def mapped(tree: Any) -> Any:
-        if _seeds(tree) > 1:
+        if len(jax.tree.leaves(tree)[0]) > 1:
             return many(f)(tree)
         return jax.tree.map(lambda x: jnp.expand_dims(x, 0), f(jax.tree.map(lambda x: x[0], tree)))
 
     def shared(tree: Any) -> Any:
-        even = _seeds(tree) % devices.count() == 0
+        even = len(jax.tree.leaves(tree)[0]) % devices.count() == 0
         return (devices.divided(mapped, (0,), 0) if even else mapped)(tree)
 
     return shared
-
-
-def _seeds(tree: Any) -> int:
-    return jax.tree.leaves(tree)[0].shape[0]
