@@ -37,16 +37,13 @@ class MetricsFile:
         self.returns: list[float] = []
         """Episode returns of the rows so far, NaN where there was none."""
         path.touch()
-        end, expected = 0, itertools.product(range(1, done + 1), range(self.seeds))
-        for (iteration, i), (row, behind) in zip(expected, files.whole_rows(path), strict=False):
-            if (row.get("iteration"), row.get("seed")) != (iteration, config.seed + i):
-                break
-            self._count(row)
-            end = behind
-        if len(self.returns) != done * self.seeds:
+        rows = list(itertools.islice(files.whole_rows(path), done * self.seeds))
+        if len(rows) != done * self.seeds:
             must = f"must hold the {done:,} iterations of the checkpoint, one row per seed"
             raise ConfigError(f"{path}: {must}")
-        os.truncate(path, end)
+        os.truncate(path, rows[-1][1] if rows else 0)
+        for row, _ in rows:
+            self._count(row)
 
     def _count(self, row: dict[str, Any]) -> None:
         value = row["episode_return"]

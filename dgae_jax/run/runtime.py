@@ -150,7 +150,8 @@ class Signals:
     """
 
     def __init__(self):
-        self.received: signal.Signals | None = None
+        self.received: Any = None
+        """SIGINT, SIGTERM or SIGHUP, once it has arrived."""
         self.agreed = False
         self.before: dict[signal.Signals, Any] = {}
 
@@ -186,21 +187,11 @@ class Signals:
             self.received, self.agreed = signal.Signals(kind), True
         return self.agreed
 
-    @property
-    def name(self) -> str:
-        """SIGINT, SIGTERM or SIGHUP."""
-        return self.received.name if self.received else ""
-
-    @property
-    def exit_code(self) -> int:
-        """130 after SIGINT, 143 after SIGTERM, 129 after SIGHUP."""
-        return 128 + (self.received or 0)
-
     def _record(self, kind: int, _) -> None:
         self.received = signal.Signals(kind)
         for each in self.before:
             signal.signal(each, signal.SIG_IGN if each == signal.SIGHUP else signal.SIG_DFL)
-        text = f"{self.name}: stopping; a second signal ends the process at once\n"
+        text = f"{self.received.name}: stopping; a second signal ends the process at once\n"
         with contextlib.suppress(OSError):  # no print: it may be what was interrupted
             os.write(2, text.encode())
 

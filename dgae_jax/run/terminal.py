@@ -88,20 +88,19 @@ class Page:
 
     def __init__(self, draw: Callable[[str], bytes | None]):
         """Keep `draw`, which returns a PNG with a text; None before there is anything to draw."""
-        self.draw, self.shown, self.due = draw, None, 0.0
+        from IPython.display import Pretty, display
+
+        self.draw, self.due = draw, 0.0
+        self.shown: Any = display(Pretty(""), display_id=True)
 
     def show(self, text: str, at_once: bool = False) -> None:
         """Replace what is shown, unless it was replaced a moment ago."""
-        from IPython.display import Image, Pretty, display
+        from IPython.display import Image, Pretty
 
         if time.monotonic() < self.due and not at_once:
             return
         png = self.draw(text)
-        output = Pretty(text) if png is None else Image(png, width=640)
-        if self.shown is None:
-            self.shown = display(output, display_id=True)
-        else:
-            self.shown.update(output)
+        self.shown.update(Pretty(text) if png is None else Image(png, width=640))
         self.due = time.monotonic() + PICTURE_SECONDS
 
 

@@ -177,8 +177,8 @@ def _run_errors(config: ResolvedConfig, run_dir: Path, signals: Signals) -> Iter
     try:
         yield
     except Stopped:
-        message = f"stopped by {signals.name}; continue with --resume {run_dir}"
-        raise RunError(signals.exit_code, message) from None
+        message = f"stopped by {signals.received.name}; continue with --resume {run_dir}"
+        raise RunError(128 + signals.received, message) from None
     except NotFiniteError as reason:
         why = f"{reason}, which is not saved"
         raise DivergedError(1, f"stopped: {why}; {_left(run_dir)}") from reason

@@ -81,8 +81,8 @@ def reproduce(sweep: Sweep, runs: Sequence[RunSpec], options: RunOptions, launch
         if waiting:
             terminal.say(f"stopping {len(waiting)} runs")
     if signals.received:
-        terminal.say(f"stopped by {signals.name}; the same command continues")
-        return signals.exit_code
+        terminal.say(f"stopped by {signals.received.name}; the same command continues")
+        return 128 + signals.received
     for name in failed:
         terminal.warn(f"failed: {name}, see {sweep.path / 'logs' / name}.log")
     return 1 if failed else 0

@@ -56,10 +56,10 @@ def tune(tuning: Tuning) -> int:
                 time.sleep(POLL)
                 done = outcome.say_new(study, done)
         if (done := outcome.say_new(study, done)) < tuning.trials:
-            how = f"by {signals.name}" if signals.received else f"early, see {logs[0]}"
+            how = f"by {signals.received.name}" if signals.received else f"early, see {logs[0]}"
             said = f"{done} of {tuning.trials} trials are finished; the same command continues"
             terminal.say(f"stopped {how}: {said}")
-            return signals.exit_code if signals.received else 1
+            return 128 + signals.received if signals.received else 1
         return outcome.write(tuning, study)
     except OSError as reason:
         allowed = f"a directory that can be written ({reason.strerror})"
