@@ -27,9 +27,9 @@ FLAGS = [*TINY, "--total-steps", "512", "--checkpoint-every", "256", "--episodes
 CACHE = TINY[-2:]
 
 
-def begun(*flags):
+def begun(*flags, out=subprocess.PIPE):
     command = [sys.executable, ROOT / "experiments" / "train.py", *map(str, flags)]
-    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    return subprocess.Popen(command, stdout=out, stderr=out, text=True)
 
 
 def finished(processes):
@@ -188,7 +188,7 @@ def test_nohup_is_respected():
 def start(run_dir):
     """Start or resume a run of 40 iterations with a checkpoint after each fifth."""
     flags = ["--run-dir", run_dir, "--total-steps", 40 * 64, "--checkpoint-every", 5 * 64]
-    return begun("--resume-or-start", *flags, "--episodes", 1, *TINY)
+    return begun("--resume-or-start", *flags, "--episodes", 1, *TINY, out=subprocess.DEVNULL)
 
 
 @pytest.mark.slow
