@@ -31,15 +31,6 @@ def test_row_is_what_the_file_says(tmp_path):
     assert read.config | {"schema": 3} == written["config"]
 
 
-def test_configuration_of_an_older_schema_is_upgraded(tmp_path):
-    written = row()
-    settings = written["config"]
-    old = {name: value for name, value in settings.items() if name != "num_steps"}
-    written["config"] = old | {"horizon": settings["num_steps"], "schema": 2}
-    (read,) = results.read(study(tmp_path, [written])).rows
-    assert read.config | {"schema": 3} == settings
-
-
 def test_file_of_results_is_a_sweep_without_a_plan(tmp_path):
     directory = study(tmp_path / "one", [row()], planned=["hopper-dppo-1"])
     assert results.read(directory).missing == ("hopper-dppo-1",)
