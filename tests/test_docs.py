@@ -136,7 +136,7 @@ def test_commands_make_the_configurations_of_the_results(study):
     made = {}
     for name, words in command_lines():
         if name == "reproduce" and words[0] == f"results/{study}":
-            made |= {run.name: to_dict(run.config) for run in reproduce.parsed(words)[1]}
+            made |= {run: to_dict(config) for run, config in reproduce.parsed(words)[1].items()}
     rows = results.read(ROOT / "results" / study).rows
     expected = {row.run: row.config | {"schema": SCHEMA} for row in rows}
     assert {name: json.loads(json.dumps(made.get(name))) for name in expected} == expected

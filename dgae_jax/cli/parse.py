@@ -29,7 +29,7 @@ from dgae_jax.configs.config import (
     flag,
     invalid,
 )
-from dgae_jax.run import terminal
+from dgae_jax.run import directory, terminal
 
 
 @dataclasses.dataclass(frozen=True)
@@ -92,15 +92,11 @@ def _with_aliases(info: constructors.StructTypeInfo) -> constructors.StructConst
     spec: Any = registry.get_struct_spec(marked)
     fields = []
     for field in spec.fields:
-        kind, text = field.type, functools.partial(_one_paragraph, field.helptext)
+        kind = field.type
         if aliases := ALIASES.get(info.type, {}).get(field.name):
             kind = Annotated[kind, tyro.conf.arg(aliases=aliases.split())]
-        fields.append(dataclasses.replace(field, type=kind, helptext=text))
+        fields.append(dataclasses.replace(field, type=kind))
     return dataclasses.replace(spec, fields=tuple(fields))
-
-
-def _one_paragraph(text: Callable[[], str | None]) -> str:
-    return " ".join((text() or "").split())
 
 
 @registry.primitive_rule
@@ -211,7 +207,9 @@ class Command(NamedTuple):
         except ConfigError as mistake:
             fail(mistake)
         except KeyboardInterrupt:
-            return interrupted()
+            terminal.warn("stopped by SIGINT")
+            sys.stdout.flush()
+            os._exit(130)  # Python would wait for XLA, or abort it
 
 
 def command(
@@ -231,15 +229,6 @@ def fail(mistake: Exception | str) -> NoReturn:
     raise SystemExit(2)
 
 
-def interrupted() -> int:
-    """Say that SIGINT ended the command; end here where a compiler would abort the process."""
-    terminal.warn("stopped by SIGINT")
-    runtime = sys.modules.get("dgae_jax.run.runtime")  # imported by now if JAX compiles
-    if runtime and runtime.is_compiling():
-        os._exit(130)
-    return 130
-
-
 def require(package: str, extra: str) -> None:
     """Raise ConfigError, naming what to install, unless a package is here."""
     if find_spec(package) is None:
@@ -249,10 +238,8 @@ def require(package: str, extra: str) -> None:
 @contextlib.contextmanager
 def writing(out: Path, kind: str = "file") -> Iterator[None]:
     """Raise ConfigError where `out` cannot be written: before the work, as far as can be seen."""
-    try:
+    with directory.must_be(f"a {kind} that can be written", out, "out"):
         is_other = out.exists() and not out.is_file()
         if kind == "file" and (is_other or not out.absolute().parent.is_dir()):
             raise invalid("out", out, "a file, new or not, in a directory that exists")
         yield
-    except OSError as reason:
-        raise invalid("out", out, f"a {kind} that can be written ({reason.strerror})") from reason

@@ -2,8 +2,10 @@
 
 import dataclasses
 import shlex
+import shutil
 import sys
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -17,12 +19,21 @@ from dgae_jax.configs.config import Config, ConfigError, invalid
 from dgae_jax.configs.resolved import ResolvedConfig, resolve
 from dgae_jax.envs.registry import TASKS
 from dgae_jax.run.options import RunOptions
+from dgae_jax.study import launch
 from dgae_jax.study import sweep as sweeps
-from dgae_jax.study.launch import LaunchOptions, launcher
-from dgae_jax.study.variants import Variant, variants
+from dgae_jax.study.variants import VARIANTS, Variant
 
-LAUNCH, TRAIN = LaunchOptions(), TrainArguments(settings=Config(env=""))
+TRAIN = TrainArguments(settings=Config(env=""))
 """Defaults; the tasks are those of --envs."""
+
+USED_BY = {
+    "processes": ("local",),
+    "address": ("ray",),
+    "cpus_per_run": ("ray", "slurm"),
+    "gpus_per_run": ("ray", "slurm"),
+    "slurm": ("slurm",),
+}
+"""The launchers that use an option."""
 
 
 @dataclass(frozen=True)
@@ -47,18 +58,32 @@ class Arguments:
     """Fraction of the samples that are trained [1]."""
     seeds_per_run: Annotated[int, parse.number(int, 1, 4096)] = 1
     """Seeds that are trained in one program; more than 1 are meant for a GPU [runs]."""
-    launch: Annotated[LaunchOptions, tyro.conf.arg(name="")] = LAUNCH
+    launcher: Literal["local", "ray", "slurm"] = "local"
+    """local (this machine), ray (a cluster) or slurm (an array of jobs)."""
+    processes: Annotated[int, parse.number(int, 1, 1024)] = launch.default_processes()
+    """local: runs at a time, each with an equal share of the cores; by default one per core, or
+    one in all with a GPU [processes]."""
+    address: str | None = None
+    """ray: HOST:PORT of the cluster's head, or auto; by default a cluster on this machine
+    [address]."""
+    cpus_per_run: Annotated[int, parse.number(int, 1, 1024)] = 1
+    """ray, slurm: cores of each run [cores]."""
+    gpus_per_run: Annotated[float, parse.number(float, 0, 64)] = 0.0
+    """ray, slurm: GPUs of each run; several runs may share one with ray [GPUs]."""
+    slurm: tuple[str, ...] = ()
+    """slurm: more of its settings, as partition=gpu time=240 (minutes) array_parallelism=32
+    [NAME=VALUE]."""
     train: Annotated[TrainArguments, tyro.conf.arg(name="")] = TRAIN
 
 
-Sweep = tuple[Arguments, list[sweeps.RunSpec], RunOptions]
+Sweep = tuple[Path, sweeps.Runs, RunOptions, launch.Launch]
 
 
 def parsed(argv: list[str]) -> Sweep:
-    """Return the flags, the runs and their options."""
+    """Return the directory, the runs, their options and their launcher."""
     args: Arguments = parse.arguments(Arguments, argv)
     _check(args)
-    kinds = _kinds(args)
+    kinds, launcher = _kinds(args), _launcher(args)
 
     def make(task: str, label: str) -> ResolvedConfig:
         algo, changes = kinds[label]
@@ -75,7 +100,7 @@ def parsed(argv: list[str]) -> Sweep:
         return resolve(config.as_config().replace(total_steps=total_steps, **changes))
 
     runs = sweeps.grid(args.envs, list(kinds), args.seeds, args.seeds_per_run, make)
-    return args, runs, args.train.run
+    return args.sweep, runs, args.train.run, launcher
 
 
 def _check(args: Arguments) -> None:
@@ -101,7 +126,7 @@ def _kinds(args: Arguments) -> dict[str, Variant]:
     if args.algos != Arguments.algos:
         shown = " ".join(args.algos)
         raise ConfigError(f"algos {shown}: cannot be combined with --variants", "algos")
-    kinds = variants(args.variants)
+    kinds = VARIANTS[args.variants]
     for path in {path for _, changes in kinds.values() for path in changes}:
         if given.get(path) != TRAIN.settings.get(path):
             both = f"cannot be combined with --variants {args.variants}, which set it"
@@ -109,13 +134,34 @@ def _kinds(args: Arguments) -> dict[str, Variant]:
     return kinds
 
 
+def _launcher(args: Arguments) -> launch.Launch:
+    """Return the launcher that is asked for; raise ConfigError if it cannot be used."""
+    name = args.launcher
+    for option, launchers in USED_BY.items():
+        value = getattr(args, option)
+        if name not in launchers and value != getattr(Arguments, option):
+            raise invalid(option, value, f"unset: it has no effect with --launcher {name}")
+    if name == "local":
+        return partial(launch.local, processes=args.processes)
+    if name == "ray":
+        launch.check_ray(args.address)
+    elif args.gpus_per_run % 1:
+        raise invalid("gpus_per_run", args.gpus_per_run, "a whole number with --launcher slurm")
+    parse.require({"ray": "ray", "slurm": "submitit"}[name], name)
+    if name == "slurm" and not shutil.which("srun"):
+        raise invalid("launcher", name, "used where Slurm is: there is no srun here")
+    resources = {"cpus": args.cpus_per_run, "gpus": args.gpus_per_run}
+    if name == "ray":
+        return partial(launch.ray_cluster, address=args.address, **resources)
+    return partial(launch.slurm_array, settings=args.slurm, **resources)
+
+
 @parse.command(Arguments, parsed)
 def reproduce(sweep: Sweep) -> int:
     """Train the runs that are not done."""
-    args, runs, options = sweep
-    launch = launcher(args.launch)
+    path, runs, options, launcher = sweep
     line = shlex.join(["dgae", "reproduce", *sys.argv[1:]])
-    with sweeps.opened(args.sweep, runs, line) as opened:
+    with sweeps.opened(path, runs, line) as opened:
         from dgae_jax.study import reproduce
 
-        return reproduce.reproduce(opened, runs, options, launch)
+        return reproduce.reproduce(opened, runs, options, launcher)

@@ -44,9 +44,9 @@ OF_ONE_RUN = (
 )
 
 
-def check_of_many(given: Arguments) -> None:
-    """Raise ConfigError for a flag that has no meaning for many runs."""
-    for name in OF_ONE_RUN:
+def check_of_many(given: Arguments, *more: str) -> None:
+    """Raise ConfigError for a flag of a single run, or another that cannot be given."""
+    for name in (*OF_ONE_RUN, *more):
         part = "run" if hasattr(given.run, name) else "settings"
         if getattr(getattr(given, part), name) != getattr(getattr(DEFAULTS, part), name):
             raise ConfigError(f"{flag(name)}: cannot be combined with many runs")

@@ -10,7 +10,7 @@ import tyro
 from dgae_jax.cli import parse
 from dgae_jax.cli.train import DEFAULTS, check_of_many, configure
 from dgae_jax.cli.train import Arguments as TrainArguments
-from dgae_jax.configs.config import ConfigError, flag
+from dgae_jax.configs.config import ConfigError
 from dgae_jax.physics import cores
 
 if TYPE_CHECKING:
@@ -46,42 +46,29 @@ class Arguments:
 def parsed(argv: list[str]) -> "Tuning":
     """Return the tuning of a command line; raise ConfigError for the first mistake."""
     args = parse.peek(Arguments, argv) or parse.arguments(Arguments, argv)
-    check_of_many(args.train)
-    for name in ("checkpoint_every", "keep_checkpoints", "inexact"):
-        if getattr(args.train.run, name) != getattr(DEFAULTS.run, name):
-            raise ConfigError(f"{flag(name)}: must be left out: a trial is judged at each quarter")
-    config, options = configure(
-        args.train,
-        lambda start: (
-            parse.arguments(Arguments, argv, dataclasses.replace(args, train=start)).train
-        ),
-    )
-    study = args.study or Path("tuning") / f"{config.task}-{config.algo}".replace(":", "-")
-    storage = _storage(args.storage)
+    check_of_many(args.train, "checkpoint_every", "keep_checkpoints", "inexact")
+    parse.require("optuna", "tune")
+    if args.storage and not args.storage.startswith("postgresql://"):
+        # the address may have a password
+        raise ConfigError("--storage: must be postgresql://USER:PASSWORD@HOST/NAME, or left out")
+
+    def parse_over(start: TrainArguments) -> TrainArguments:
+        return parse.arguments(Arguments, argv, dataclasses.replace(args, train=start)).train
+
+    config, options = configure(args.train, parse_over)
     from dgae_jax.study.search import Tuning, space_of
 
     return Tuning(
         config,
         space_of(args.search, config),
-        study,
-        options,
-        storage,
+        args.study or Path("tuning") / f"{config.task}-{config.algo}".replace(":", "-"),
+        dataclasses.replace(options, num_processes=1),
+        args.storage,
         trials=args.trials,
         seeds=args.tuning_seeds,
         workers=min(args.workers, args.trials),
         sampler_seed=args.sampler_seed,
     )
-
-
-def _storage(url: str | None) -> str | None:
-    """Return the address as SQLAlchemy takes it, with the driver that we install."""
-    for name in ("optuna", "psycopg"):
-        parse.require(name, "tune")
-    scheme, _, rest = (url or "").partition("://")
-    if url and not (rest and scheme in ("postgresql", "postgres", "postgresql+psycopg")):
-        # the address may have a password
-        raise ConfigError("--storage: must be postgresql://USER:PASSWORD@HOST/NAME, or left out")
-    return f"postgresql+psycopg://{rest}" if url else None
 
 
 @parse.command(Arguments, parsed)

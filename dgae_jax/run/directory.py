@@ -45,12 +45,12 @@ def created(path: Path, config: ResolvedConfig, options: RunOptions) -> Iterator
 
     `config.json` is written last: without it a directory counts as empty, and no run has begun.
     """
-    with _must_be("a directory that can be written", path):
+    with must_be("a directory that can be written", path):
         path.mkdir(parents=True, exist_ok=True)
         _check_empty(path)
     with locked(path):
         _check_empty(path)  # again: another process may have been quicker
-        with _must_be("a directory that can be written", path):
+        with must_be("a directory that can be written", path):
             (path / "checkpoints").mkdir(exist_ok=True)
             files.write_json(path / "manifest.json", {**_part(options), "resumed": []})
             files.write_json(path / "config.json", to_dict(config))
@@ -58,11 +58,13 @@ def created(path: Path, config: ResolvedConfig, options: RunOptions) -> Iterator
 
 
 @contextlib.contextmanager
-def _must_be(what: str, path: Path) -> Iterator[None]:
+def must_be(what: str, path: Path, setting: str = "") -> Iterator[None]:
+    """Turn an OSError into a ConfigError that says what `path` must be."""
     try:
         yield
     except OSError as reason:
-        raise ConfigError(f"{path}: must be {what} ({reason.strerror})") from reason
+        message = f"{setting} {path}: must be {what} ({reason.strerror})".lstrip()
+        raise ConfigError(message, setting) from reason
 
 
 def _check_empty(path: Path) -> None:
@@ -85,7 +87,7 @@ def has_begun(path: Path) -> bool:
 @contextlib.contextmanager
 def locked(path: Path) -> Iterator[None]:
     """Hold the run directory, by its metrics; the lock ends with the process."""
-    with _must_be("a directory that can be written", path):
+    with must_be("a directory that can be written", path):
         file = (path / "metrics.jsonl").open("a")
     with file:
         hold(file, InUseError(f"{path}: must not be in use; another process is training there"))
@@ -105,7 +107,7 @@ def hold(file: IO, in_use: ConfigError) -> None:
 
 def config_of(source: Path) -> ResolvedConfig:
     """Return the configuration of a run directory or policy file; raise ConfigError for others."""
-    with _must_be("a run directory or a policy file", source):
+    with must_be("a run directory or a policy file", source):
         if not source.is_file():
             return read_config(source)
     from dgae_jax.run import checkpoint
@@ -115,7 +117,7 @@ def config_of(source: Path) -> ResolvedConfig:
 
 def read_config(path: Path) -> ResolvedConfig:
     """Return the configuration of a run directory; raise ConfigError if it has links or pipes."""
-    with _must_be("a run directory", path):
+    with must_be("a run directory", path):
         for each in [*path.iterdir(), *path.glob("checkpoints/*")]:
             if each.is_symlink() or each.is_fifo():
                 raise ConfigError(f"{each}: must be a file or directory, not a link or pipe")
@@ -124,7 +126,7 @@ def read_config(path: Path) -> ResolvedConfig:
 
 def read_config_file(path: Path) -> ResolvedConfig:
     """Return the configuration in a file of JSON; raise ConfigError if there is none."""
-    with _must_be("a configuration that can be read", path):
+    with must_be("a configuration that can be read", path):
         data = path.read_bytes()
     try:
         return resolve(from_dict(json.loads(data)))

@@ -5,7 +5,6 @@ import dataclasses
 import json
 import os
 import time
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +17,7 @@ from dgae_jax.run import checkpoint, files, metrics, terminal
 from dgae_jax.run.options import RunOptions
 from dgae_jax.run.runtime import Signals
 from dgae_jax.study.launch import Launch
-from dgae_jax.study.sweep import RunSpec, Sweep
+from dgae_jax.study.sweep import Runs, Sweep, label_of
 from dgae_jax.study.worker import Job, train_run
 
 POLL = 0.5
@@ -31,12 +30,12 @@ Rows = list[dict[str, Any]]
 """Rows of `results.jsonl`, one per seed."""
 
 
-def reproduce(sweep: Sweep, runs: Sequence[RunSpec], options: RunOptions, launch: Launch) -> int:
+def reproduce(sweep: Sweep, asked: Runs, options: RunOptions, launch: Launch) -> int:
     """Train the runs that are not done, and keep `results.jsonl` up to date.
 
     Args:
         sweep: the sweep, opened by this process.
-        runs: those of its runs that are asked for.
+        asked: those of its runs that are asked for.
         options: options of every run.
         launch: the launcher.
 
@@ -49,12 +48,11 @@ def reproduce(sweep: Sweep, runs: Sequence[RunSpec], options: RunOptions, launch
     jax.config.update("jax_platforms", "cpu")  # accelerators are left to the runs
     rows = read_results(sweep)
     write_results(sweep, rows)
-    missing = {run.name: run for run in runs if run.name not in rows}
-    jobs = [_job(sweep, run, options) for run in missing.values()]
+    missing = {run: config for run, config in asked.items() if run not in rows}
+    jobs = [_job(sweep, run, options) for run in missing]
     left = f", {len(jobs)} to train" if jobs else ""
-    terminal.say(f"{sweep.path}: {len(runs) - len(jobs)} of {len(runs)} runs are done{left}")
-    configs = [run.config for run in missing.values()]
-    total = sum(c.iterations * c.samples_per_iteration * c.num_seeds for c in configs)
+    terminal.say(f"{sweep.path}: {len(asked) - len(jobs)} of {len(asked)} runs are done{left}")
+    total = sum(c.iterations * c.samples_per_iteration * c.num_seeds for c in missing.values())
     began, before, failed = time.monotonic(), _steps(sweep, missing), []
     with (
         Signals() as signals,
@@ -64,14 +62,14 @@ def reproduce(sweep: Sweep, runs: Sequence[RunSpec], options: RunOptions, launch
         waiting = dict(tasks)
         while waiting and not signals.received:
             for task in [task for task in waiting if task.done()]:
-                run = missing[waiting.pop(task).name]
+                run = waiting.pop(task).name
                 if reason := _failure(sweep, run, task):
-                    failed.append(run.name)
-                    terminal.say(f"{run.name}: {reason}")
+                    failed.append(run)
+                    terminal.say(f"{run}: {reason}")
                     continue
-                rows[run.name] = rows_of(sweep, run)
+                rows[run] = rows_of(sweep, run)
                 write_results(sweep, rows)
-                terminal.say(_summary(run, rows[run.name]))
+                terminal.say(_summary(run, rows[run]))
             steps = _steps(sweep, missing)
             speed = (steps - before) / (time.monotonic() - began)
             left = terminal.clock((total - steps) / speed) if speed else "unknown"
@@ -83,18 +81,18 @@ def reproduce(sweep: Sweep, runs: Sequence[RunSpec], options: RunOptions, launch
     if signals.received:
         terminal.say(f"stopped by {signals.received.name}; the same command continues")
         return 128 + signals.received
-    for name in failed:
-        terminal.warn(f"failed: {name}, see {sweep.path / 'logs' / name}.log")
+    for run in failed:
+        terminal.warn(f"failed: {run}, see {sweep.log(run)}")
     return 1 if failed else 0
 
 
-def _job(sweep: Sweep, run: RunSpec, options: RunOptions) -> Job:
+def _job(sweep: Sweep, run: str, options: RunOptions) -> Job:
     where = {"run_dir": sweep.run_dir(run).absolute(), "resume_or_start": True}
-    args = run.config, dataclasses.replace(options, num_processes=1, **where)
-    return Job(run.name, train_run, args, sweep.log(run).absolute())
+    args = sweep.runs[run], dataclasses.replace(options, num_processes=1, **where)
+    return Job(run, train_run, args, sweep.log(run).absolute())
 
 
-def _failure(sweep: Sweep, run: RunSpec, task: Any) -> str | None:
+def _failure(sweep: Sweep, run: str, task: Any) -> str | None:
     """Return why a run has no result, by the last line of its log."""
     try:
         code = task.result()
@@ -107,17 +105,17 @@ def _failure(sweep: Sweep, run: RunSpec, task: Any) -> str | None:
     return f"ended with exit code {code}: {lines[-1][:300] if lines else 'no output'}"
 
 
-def _summary(run: RunSpec, rows: Rows) -> str:
+def _summary(run: str, rows: Rows) -> str:
     means = [row["final"]["return_mean"] for row in rows]
     shown = " ".join("not finite" if mean is None else f"{mean:,.1f}" for mean in means)
-    return f"{run.name}: return {shown}, {rows[0]['samples_per_second']:,.0f} steps/s"
+    return f"{run}: return {shown}, {rows[0]['samples_per_second']:,.0f} steps/s"
 
 
-def _steps(sweep: Sweep, runs: dict[str, RunSpec]) -> int:
-    return sum(reached(sweep, run) * run.config.num_seeds for run in runs.values())
+def _steps(sweep: Sweep, runs: Runs) -> int:
+    return sum(reached(sweep, run) * config.num_seeds for run, config in runs.items())
 
 
-def reached(sweep: Sweep, run: RunSpec) -> int:
+def reached(sweep: Sweep, run: str) -> int:
     """Return the steps in the last whole row of the metrics of a run."""
     try:
         with (sweep.run_dir(run) / "metrics.jsonl").open("rb") as file:
@@ -127,7 +125,7 @@ def reached(sweep: Sweep, run: RunSpec) -> int:
         return 0
 
 
-def is_done(sweep: Sweep, run: RunSpec) -> bool:
+def is_done(sweep: Sweep, run: str) -> bool:
     """Return whether the run has reached its end."""
     return (sweep.run_dir(run) / "evaluation.json").is_file()
 
@@ -138,27 +136,23 @@ def read_results(sweep: Sweep) -> dict[str, Rows]:
     A run keeps its rows if its directory is on another machine.
     """
     path = sweep.path / "results.jsonl"
-    before: dict[str, Rows] = {}
+    found: dict[str, Rows] = {}
     for row in metrics.read(path) if path.is_file() else []:
-        before.setdefault(row.get("cell", ""), []).append(row)
-    found = {}
-    for run in sweep.runs:
-        if is_done(sweep, run):
-            found[run.name] = rows_of(sweep, run)
-        elif run.name in before and not sweep.run_dir(run).exists():
-            found[run.name] = before[run.name]
-    return found
+        run = row.get("cell", "")
+        if run in sweep.runs and not sweep.run_dir(run).exists():
+            found.setdefault(run, []).append(row)
+    return found | {run: rows_of(sweep, run) for run in sweep.runs if is_done(sweep, run)}
 
 
 def write_results(sweep: Sweep, rows: dict[str, Rows]) -> None:
     """Write the rows of the runs that are done, in the order of the sweep."""
-    ordered = (row for run in sweep.runs for row in rows.get(run.name, []))
+    ordered = (row for run in sweep.runs for row in rows.get(run, []))
     files.replace(sweep.path / "results.jsonl", files.json_lines(ordered))
 
 
-def rows_of(sweep: Sweep, run: RunSpec) -> Rows:
+def rows_of(sweep: Sweep, run: str) -> Rows:
     """Return a row per seed of a run that is done, and write its policy."""
-    run_dir, config = sweep.run_dir(run), run.config
+    run_dir, config, label = sweep.run_dir(run), sweep.runs[run], label_of(run, sweep.runs[run])
     _write_policy(run_dir, config, sweep.policy(run))
     final = json.loads((run_dir / "evaluation.json").read_bytes())
     manifest = json.loads((run_dir / "manifest.json").read_bytes())
@@ -170,12 +164,12 @@ def rows_of(sweep: Sweep, run: RunSpec) -> Rows:
         evaluations = [row for row in evaluated if row["seed"] == one["seed"]]
         rows.append(
             {
-                "cell": run.name,
+                "cell": run,
                 "env": config.env,
                 "env_version": config.env_version,
                 "algo": config.algo,
                 "physics": config.physics,
-                "variant": None if run.label == config.algo else run.label,
+                "variant": None if label == config.algo else label,
                 "seed": one["seed"],
                 "total_steps": config.total_steps,
                 "steps": steps,
@@ -198,7 +192,7 @@ def rows_of(sweep: Sweep, run: RunSpec) -> Rows:
                 "versions": manifest["versions"],
                 "machine": {name: manifest[name] for name in ("device", "cores")},
                 "git_revision": manifest["git_revision"],
-                "command": sweep.commands.get(run.name),
+                "command": sweep.commands.get(run),
             }
         )
     return rows

@@ -12,39 +12,24 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from optuna.distributions import CategoricalDistribution, FloatDistribution, IntDistribution
+
 from dgae_jax.configs.config import ConfigError, invalid
 from dgae_jax.configs.resolved import ResolvedConfig, resolve
 from dgae_jax.run.options import RunOptions
 
-SHARED = ("env", "env_version", "algo", "physics", "total_steps", "episode_length")
-"""Settings that say what is measured; all trials share them, and the seeds."""
+SHARED = (
+    *("env", "env_version", "algo", "physics", "total_steps", "episode_length"),
+    *("seed", "num_seeds"),
+)
+"""Settings that say what is measured; all trials share them."""
 
 FIRST_SEED = 1000
 """First seed of the trials; reports use 0, 1, …, which no choice of settings has seen."""
 
 
-@dataclass(frozen=True)
-class Values:
-    """The values that trials may give to a setting."""
-
-    text: str
-    kind: str
-    """float, int or categorical, as in the methods of Optuna's `Trial`."""
-    ends: Sequence[Any]
-    """Lowest and highest value, or all choices."""
-    is_log: bool = False
-
-    def suggest(self, trial: Any, path: str) -> Any:
-        """Return the value that Optuna suggests for the setting in a trial."""
-        if self.kind == "categorical":
-            return trial.suggest_categorical(path, self.ends)
-        return getattr(trial, f"suggest_{self.kind}")(path, *self.ends, log=self.is_log)
-
-    def include(self, value: Any) -> bool:
-        """Return whether a trial could give this value."""
-        if self.kind == "categorical":
-            return value in self.ends
-        return self.ends[0] <= value <= self.ends[1]
+Values = FloatDistribution | IntDistribution | CategoricalDistribution
+"""The values that trials may give to a setting."""
 
 
 @dataclass(frozen=True)
@@ -58,23 +43,19 @@ class Tuning:
     directory: Path
     options: RunOptions = field(default_factory=RunOptions)
     storage: str | None = None
-    """URL of a PostgreSQL database; None for SQLite in the directory."""
     trials: int = 50
     seeds: int = 2
     workers: int = 1
     sampler_seed: int = 0
-    heartbeat: int = 20
-    """Time between heartbeats; a trial without one for three times as long is retried [s]."""
 
     def trial_config(self, values: Mapping[str, Any]) -> ResolvedConfig:
         """Return the configuration of a trial; raise ConfigError if its values are invalid."""
         return _with_values(self.config, {**values, "seed": FIRST_SEED, "num_seeds": self.seeds})
 
-    def start_values(self) -> dict[str, Any] | None:
-        """Return the configuration's own values; None if one of them is outside the space."""
+    def start_values(self) -> dict[str, Any]:
+        """Return the configuration's own values of what is searched."""
         values = {path: self.config.as_config().get(path) for path in self.space}
-        values |= {k: "x".join(map(str, v)) for k, v in values.items() if isinstance(v, tuple)}
-        return values if all(self.space[k].include(v) for k, v in values.items()) else None
+        return {k: "x".join(map(str, v)) if isinstance(v, tuple) else v for k, v in values.items()}
 
 
 def space_of(words: Sequence[str], config: ResolvedConfig) -> dict[str, Values]:
@@ -84,33 +65,28 @@ def space_of(words: Sequence[str], config: ResolvedConfig) -> dict[str, Values]:
         name, _, text = word.partition("=")
         path = name.replace("-", "_")
         try:
-            if path in (*SHARED, "seed", "num_seeds"):
+            if path in SHARED:
                 raise ConfigError(f"cannot be searched: all trials share {path}")
             if path in space:
                 raise ConfigError(f"{path} is given twice")
-            space[path] = _values(text)
-            for value in space[path].ends:
+            space[path], values = _values(text)
+            for value in values:
                 _with_values(config, {path: value})
-        except ConfigError as reason:
-            raise ConfigError(f"search {word}: {reason}", "search") from None
-        except ValueError:
+        except ValueError as reason:
             forms = "LOW:HIGH, log:LOW:HIGH, int:LOW:HIGH, int:log:LOW:HIGH or VALUE,VALUE"
-            raise invalid("search", word, f"SETTING={forms}, with LOW below HIGH") from None
+            raise invalid("search", word, f"SETTING={forms} ({reason})") from None
     return space
 
 
-def _values(text: str) -> Values:
-    """Parse the part after `=`; raise ValueError."""
+def _values(text: str) -> tuple[Values, Sequence[Any]]:
+    """Parse the part after `=`, also to both ends or all choices; raise ValueError."""
     if found := re.fullmatch(r"(int:)?(log:)?([^:,]+):([^:,]+)", text):
-        kind, is_log = int if found[1] else float, bool(found[2])
-        low, high = kind(found[3]), kind(found[4])
-        if not low < high or (is_log and low <= 0):
-            raise ValueError(text)
-        return Values(text, kind.__name__, (low, high), is_log)
-    choices = tuple(_choice(word) for word in text.split(","))
-    if len(set(choices)) != len(choices) or len(choices) < 2 or "" in choices:
-        raise ValueError(text)
-    return Values(text, "categorical", choices)
+        is_int, is_log, low, high = found.groups()
+        kind: Any = IntDistribution if is_int else FloatDistribution
+        values = [int(low), int(high)] if is_int else [float(low), float(high)]
+        return kind(*values, log=bool(is_log)), values
+    choices = [_choice(word) for word in text.split(",") if word]
+    return CategoricalDistribution(choices), choices
 
 
 def _choice(text: str) -> Any:

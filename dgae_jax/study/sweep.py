@@ -28,41 +28,29 @@ NAME = re.compile(r"\w[\w.+-]{,199}")
 """Allowed names of runs, which become names of files."""
 
 
-class RunSpec(NamedTuple):
-    """One run of a sweep."""
-
-    name: str
-    """ENV-LABEL-SEED, and -LAST if it trains several seeds."""
-    config: ResolvedConfig
-
-    @property
-    def label(self) -> str:
-        """The algorithm or the variant."""
-        config = self.config
-        seeds = range(config.seed, config.seed + config.num_seeds)
-        before, after = _name(config.env, "/", seeds).split("/")
-        return self.name.removeprefix(before).removesuffix(after)
+Runs = dict[str, ResolvedConfig]
+"""Configurations by the names of runs: ENV-LABEL-SEED, and -LAST for several seeds."""
 
 
 class Sweep(NamedTuple):
     """A directory and all runs that were ever asked for there."""
 
     path: Path
-    runs: tuple[RunSpec, ...]
+    runs: Runs
     commands: dict[str, str]
     """The command line that first asked for each run, by its name."""
 
-    def run_dir(self, run: RunSpec) -> Path:
+    def run_dir(self, run: str) -> Path:
         """Return the run directory."""
-        return self.path / "runs" / run.name
+        return self.path / "runs" / run
 
-    def log(self, run: RunSpec) -> Path:
+    def log(self, run: str) -> Path:
         """Return the file of the run's output."""
-        return self.path / "logs" / f"{run.name}.log"
+        return self.path / "logs" / f"{run}.log"
 
-    def policy(self, run: RunSpec) -> Path:
+    def policy(self, run: str) -> Path:
         """Return the file of the run's final policy."""
-        return self.path / "policies" / f"{run.name}.msgpack"
+        return self.path / "policies" / f"{run}.msgpack"
 
 
 def grid(
@@ -71,7 +59,7 @@ def grid(
     seeds: Sequence[int],
     seeds_per_run: int,
     make: Callable[[str, str], ResolvedConfig],
-) -> list[RunSpec]:
+) -> Runs:
     """Return tasks × labels × seeds, the first seeds of all of them first.
 
     Args:
@@ -90,14 +78,11 @@ def grid(
         if list(group) != list(range(group[0], group[0] + len(group))):
             allowed = f"1, or a number of consecutive seeds, not {list(group)}"
             raise invalid("seeds_per_run", seeds_per_run, allowed)
-    return [
-        RunSpec(
-            _name(task, label, group),
-            dataclasses.replace(config, seed=group[0], num_seeds=len(group)),
-        )
+    return {
+        _name(*pair, group): dataclasses.replace(config, seed=group[0], num_seeds=len(group))
         for group in groups
-        for (task, label), config in configs.items()
-    ]
+        for pair, config in configs.items()
+    }
 
 
 def _name(task: str, label: str, seeds: Sequence[int]) -> str:
@@ -105,8 +90,15 @@ def _name(task: str, label: str, seeds: Sequence[int]) -> str:
     return f"{re.sub('[:/]', '_', task)}-{label}-{seeds[0]}{last}"
 
 
+def label_of(run: str, config: ResolvedConfig) -> str:
+    """Return the algorithm or the variant in the name of a run."""
+    seeds = range(config.seed, config.seed + config.num_seeds)
+    before, after = _name(config.env, "/", seeds).split("/")
+    return run.removeprefix(before).removesuffix(after)
+
+
 @contextlib.contextmanager
-def opened(path: Path, runs: Sequence[RunSpec], command: str) -> Iterator[Sweep]:
+def opened(path: Path, runs: Runs, command: str) -> Iterator[Sweep]:
     """Open a sweep, with some runs added to those that it has, and lock it.
 
     Args:
@@ -118,37 +110,32 @@ def opened(path: Path, runs: Sequence[RunSpec], command: str) -> Iterator[Sweep]
         ConfigError: the directory holds anything else, cannot be written or is in use, or a run
             has another configuration there.
     """
-    try:
+    with directory.must_be("a directory that can be written", path):
         is_sweep = (path / "study.json").exists()
         if path.exists() and not is_sweep and any(x.name != ".lock" for x in path.iterdir()):
-            raise ConfigError(f"study {path}: must be a sweep, or a new or empty directory")
+            raise ConfigError(f"{path}: must be a sweep, or a new or empty directory")
         path.mkdir(parents=True, exist_ok=True)
         with (path / ".lock").open("w") as lock:
-            in_use = f"study {path}: must not be in use; another process runs it"
+            in_use = f"{path}: must not be in use; another process runs it"
             directory.hold(lock, ConfigError(in_use))
-            before = read(path) if is_sweep else Sweep(path, (), {})
+            before = read(path) if is_sweep else Sweep(path, {}, {})
             sweep = _joined(before, runs, command)
             for part in ("runs", "logs", "policies"):
                 (path / part).mkdir(exist_ok=True)
             if sweep != before:
-                cells = {name: to_dict(config) for name, config in sweep.runs}
+                cells = {run: to_dict(config) for run, config in sweep.runs.items()}
                 data = {"schema": SCHEMA, "cells": cells, "commands": sweep.commands}
                 files.write_json(path / "study.json", data)
             yield sweep
-    except OSError as reason:
-        allowed = f"must be a directory that can be written ({reason.strerror})"
-        raise ConfigError(f"study {path}: {allowed}") from reason
 
 
-def _joined(before: Sweep, runs: Sequence[RunSpec], command: str) -> Sweep:
-    there = dict(before.runs)
-    for name, config in runs:
-        for setting, (ours, theirs) in differences(config, there.get(name, config)).items():
+def _joined(before: Sweep, runs: Runs, command: str) -> Sweep:
+    for run, config in runs.items():
+        for setting, (ours, theirs) in differences(config, before.runs.get(run, config)).items():
             allowed = f"must be {theirs} as in {before.path}, not {ours}; or use another directory"
-            raise ConfigError(f"run {name}: its {setting} {allowed}")
-    new = [run for run in runs if run.name not in there]
-    commands = {**before.commands, **{run.name: command for run in new}}
-    return Sweep(before.path, (*before.runs, *new), commands)
+            raise ConfigError(f"run {run}: its {setting} {allowed}")
+    new = {run: command for run in runs if run not in before.runs}
+    return Sweep(before.path, before.runs | runs, before.commands | new)
 
 
 def read(path: Path) -> Sweep:
@@ -158,17 +145,16 @@ def read(path: Path) -> Sweep:
         ConfigError: there is no sweep that can be read.
     """
     file = path / "study.json"
+    with directory.must_be("the directory of a sweep", path):
+        content = file.read_bytes()
     try:
-        data = json.loads(file.read_bytes())
+        data = json.loads(content)
         if data["schema"] != SCHEMA:
-            raise ConfigError(f"{file}: schema {data['schema']}: must be {SCHEMA}")
-        runs = [RunSpec(name, resolve(from_dict(x))) for name, x in data["cells"].items()]
-        for name, _ in runs:
-            if not NAME.fullmatch(name):
-                raise ValueError(f"{name[:100]!r} cannot be the name of a run")
-        return Sweep(path, tuple(runs), dict(data["commands"]))
-    except OSError as reason:
-        allowed = f"must be the directory of a sweep ({reason.strerror})"
-        raise ConfigError(f"study {path}: {allowed}") from reason
+            raise ValueError(f"its schema is {data['schema']}, not {SCHEMA}")
+        runs = {run: resolve(from_dict(config)) for run, config in data["cells"].items()}
+        for run in runs:
+            if not NAME.fullmatch(run):
+                raise ValueError(f"{run[:100]!r} cannot be the name of a run")
+        return Sweep(path, runs, dict(data["commands"]))
     except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as reason:
         raise ConfigError(f"{file}: must be a sweep that can be read ({reason})") from reason

@@ -2,8 +2,6 @@
 
 from typing import Any
 
-from dgae_jax.configs.validation import lookup
-
 Variant = tuple[str, dict[str, Any]]
 """An algorithm, and the settings by path in which the variant departs from its preset."""
 
@@ -62,8 +60,3 @@ VARIANTS: dict[str, dict[str, Variant]] = {
 }
 """By question: what the gain of distributional critics comes from, without and with noise on the
 task; what makes their distributions calibrated; what a risk-averse metric costs and gains."""
-
-
-def variants(question: str) -> dict[str, Variant]:
-    """Return the variants of a question by name; raise ConfigError for an unknown question."""
-    return lookup("variants", question, VARIANTS)

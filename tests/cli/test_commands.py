@@ -5,26 +5,21 @@ import os
 import signal
 import subprocess
 import sys
-import threading
 import time
 
 import pytest
 
 from dgae_jax.cli import parse
 from dgae_jax.cli.train import parsed
-from dgae_jax.run import directory, metrics, runtime
+from dgae_jax.run import directory, metrics
 from tests.helpers import ROOT, TINY
 
 
-def test_training_writes_a_run_directory(trained):
+def test_training_writes_a_run_directory_within_its_budget(trained):
     run_dir, lines, errors = trained
     names = "config.json manifest.json metrics.jsonl evaluations.jsonl evaluation.json"
     assert {p.name for p in run_dir.iterdir()} == {*names.split(), "checkpoints", "curve.png"}
     assert (errors, "\x1b" in "".join(lines)) == ("", False)
-
-
-def test_the_budget_is_never_exceeded_and_the_last_line_is_the_return(trained):
-    run_dir, lines, _ = trained
     assert lines[0].endswith("15 iterations × 64 samples × 1 seed")
     rows = metrics.read(run_dir / "metrics.jsonl")
     assert [row["steps"] for row in rows] == list(range(64, 961, 64))
@@ -72,19 +67,14 @@ def test_a_resumed_run_starts_from_its_own_flags(trained):
     assert (options.checkpoint_every, options.episodes, options.keep_checkpoints) == (300, 5, 3)
 
 
-def test_an_interrupt_ends_the_process_under_a_running_compiler(monkeypatch, capsys):
+def test_an_interrupt_ends_the_process_at_once(monkeypatch, capsys):
     def interrupt(argv):
         raise KeyboardInterrupt
 
-    codes, idle, command = [], threading.Event(), parse.Command(None, interrupt, None)
+    codes = []
     monkeypatch.setattr(os, "_exit", codes.append)
-    assert (command(), codes, capsys.readouterr().err) == (130, [], "stopped by SIGINT\n")
-    left = threading.Thread(target=idle.wait, name=runtime.COMPILER_THREAD, daemon=True)
-    left.start()
-    command()
-    idle.set()
-    left.join()
-    assert codes == [130]
+    parse.Command(None, interrupt, None)()
+    assert (codes, capsys.readouterr().err) == ([130], "stopped by SIGINT\n")
 
 
 @pytest.mark.parametrize(("kind", "code"), [(signal.SIGTERM, 143), (signal.SIGINT, 130)])

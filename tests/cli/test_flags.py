@@ -68,8 +68,12 @@ def test_names_and_numbers_of_other_trainers_are_understood(words, setting, valu
         ("reproduce x --envs Ant-v4", "--envs Ant-v4: must be in lower case"),
         ("reproduce x --scale 1e-4", "--total-steps 100: must be at least one iteration"),
         ("reproduce x --variants risk --lam 0", "--gae-lambda 0.0: cannot be combined with"),
+        ("reproduce x --launcher cloud", "invalid choice 'cloud'"),
+        ("reproduce x --processes 0", "0: must be a whole number from 1 to 1,024"),
+        ("reproduce x --launcher ray --processes 1000", "--processes 1000: must be unset"),
+        ("reproduce x --launcher ray --address a", "--address a: must be auto, or HOST:PORT"),
         ("tune --seed 1", "--seed: cannot be combined with many runs"),
-        ("tune --keep-checkpoints 1", "--keep-checkpoints: must be left out: a trial"),
+        ("tune --keep-checkpoints 1", "--keep-checkpoints: cannot be combined with"),
         (
             "reproduce x --variants risk --algos ppo",
             "--algos ppo: cannot be combined with --variants",
@@ -140,15 +144,11 @@ def test_help_shows_the_defaults_of_the_algorithm(dgae):
 
 
 @pytest.mark.parametrize("name", COMMANDS)
-def test_help_explains_every_flag(name, dgae):
+def test_help_names_every_command_and_explains_every_flag(name, dgae):
+    assert all(re.search(rf"• {name}\b", dgae(*argv)[1]) for argv in ([], ["--help"]))
     code, out, err = dgae(name, "--help")
     assert (code, err) == (0, "")
     assert not re.search(r"(FLOAT|INT|STR|PATH|\]\]|\}) \((default|required)", one_line(out))
-
-
-def test_help_names_every_command(dgae):
-    for argv in ([], ["--help"]):
-        assert all(re.search(rf"• {name}\b", dgae(*argv)[1]) for name in COMMANDS)
 
 
 @pytest.mark.skipif(not shutil.which("bash"), reason="no bash")

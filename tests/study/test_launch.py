@@ -6,38 +6,17 @@ import pytest
 
 from dgae_jax.configs.config import ConfigError
 from dgae_jax.study import launch
-from dgae_jax.study.launch import LaunchOptions, launcher, slurm_parameters
+from dgae_jax.study.worker import Job
 
 
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"launcher": "cloud"}, "launcher cloud: must be one of local, ray, slurm"),
-        ({"processes": 0}, "processes 0: must be from 1 to 1,024"),
-        ({"launcher": "ray", "processes": 2}, "processes 2: must be unset"),
-        ({"address": "auto"}, "address auto: must be unset"),
-        ({"launcher": "ray", "address": "head"}, "address head: must be auto, or HOST:PORT"),
-        ({"launcher": "ray", "cpus_per_run": 0}, "cpus_per_run 0: must be from 1"),
-        ({"launcher": "ray", "gpus_per_run": -1}, "gpus_per_run -1: must be from 0 to 64"),
-    ],
-)
-def test_an_invalid_option_is_refused_before_anything_starts(options, message):
-    with pytest.raises(ConfigError, match=message):
-        launcher(LaunchOptions(**options))
-
-
-def test_slurm_is_refused_where_there_is_none(monkeypatch):
-    pytest.importorskip("submitit")
-    monkeypatch.setenv("PATH", "")
-    with pytest.raises(ConfigError, match="launcher slurm: must be used where Slurm is"):
-        launcher(LaunchOptions(launcher="slurm"))
-
-
-def test_slurm_settings_are_given_as_name_and_value():
-    options = LaunchOptions(slurm=("partition=gpu", "time=60"))
-    assert slurm_parameters(options) == {"slurm_partition": "gpu", "slurm_time": 60}
-    with pytest.raises(ConfigError, match="slurm gpu: must be NAME=VALUE"):
-        slurm_parameters(LaunchOptions(slurm=("gpu",)))
+def test_settings_that_slurm_does_not_know_are_refused(tmp_path, monkeypatch):
+    submitit = pytest.importorskip("submitit")
+    executor = submitit.AutoExecutor
+    monkeypatch.setattr(submitit, "AutoExecutor", lambda folder, _: executor(folder, "local"))
+    jobs = [Job("one", print, (), tmp_path / "logs" / "one.log")]
+    message = "launcher slurm: must be used with settings .*Unknown argument 'gpu'"
+    with pytest.raises(ConfigError, match=message), launch.slurm_array(jobs, 1, 0, ["gpu"]):
+        pass
 
 
 @pytest.mark.parametrize(

@@ -120,9 +120,9 @@ def test_progress_is_read_from_the_last_whole_row(copy, end):
     file = copy / "runs" / NAMES[0] / "metrics.jsonl"
     rows = [{"steps": 64 * i, "episode_return": i, "more": "x" * 500} for i in range(100)]
     file.write_text("".join(json.dumps(row) + "\n" for row in rows) + end)
-    assert reached(sweep, sweep.runs[0]) == (0 if end == "[]\n" else 64 * 99)
+    assert reached(sweep, NAMES[0]) == (0 if end == "[]\n" else 64 * 99)
     file.unlink()
-    assert reached(sweep, sweep.runs[0]) == 0
+    assert reached(sweep, NAMES[0]) == 0
 
 
 @pytest.mark.slow
@@ -188,8 +188,10 @@ def test_a_run_whose_ray_node_dies_continues_on_another(longer, tmp_path):
 def test_submitit_runs_a_sweep(longer, tmp_path):
     pytest.importorskip("submitit")
     program = (
-        "from dgae_jax.study import launch; from dgae_jax.cli.reproduce import reproduce\n"
-        "launch.SLURM_EXECUTOR = 'local'; raise SystemExit(reproduce())"
+        "import shutil, submitit; from dgae_jax.cli.reproduce import reproduce\n"
+        "Auto = submitit.AutoExecutor\n"
+        "submitit.AutoExecutor = lambda folder, _: Auto(folder, 'local')\n"
+        "shutil.which = str; raise SystemExit(reproduce())"
     )
     more = ["--launcher", "slurm"]
     studies.succeed(studies.start(tmp_path, *more, steps=400, program=("-c", program)))

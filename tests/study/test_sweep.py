@@ -11,7 +11,7 @@ from dgae_jax.configs.serial import differences, from_dict
 from dgae_jax.run import metrics
 from dgae_jax.study import reproduce
 from dgae_jax.study import sweep as sweeps
-from dgae_jax.study.variants import VARIANTS, variants
+from dgae_jax.study.variants import VARIANTS
 from tests.helpers import ROOT
 
 COMMITTED = sorted(path.parent for path in (ROOT / "results").glob("*/study.json"))
@@ -25,36 +25,32 @@ def grid(seeds=(0, 1), per_run=1, make=make):
     return sweeps.grid(["hopper", "ant"], ["ppo", "dppo"], seeds, per_run, make)
 
 
-def names(runs):
-    return [run.name for run in runs]
-
-
 def test_the_first_seeds_of_all_pairs_come_first():
     runs = ["hopper-ppo-0", "hopper-dppo-0", "ant-ppo-0", "ant-dppo-0", "hopper-ppo-1"]
-    assert names(grid())[:5] == runs
-    assert [run.label for run in grid()][:4] == ["ppo", "dppo", "ppo", "dppo"]
+    assert list(grid())[:5] == runs
+    assert [sweeps.label_of(*run) for run in grid().items()][:4] == ["ppo", "dppo", "ppo", "dppo"]
 
 
 def test_several_seeds_of_a_run_must_be_consecutive():
-    runs = grid((0, 1, 2, 3), 2)[::4]
-    assert names(runs) == ["hopper-ppo-0-1", "hopper-ppo-2-3"]
-    assert [(run.config.seed, run.config.num_seeds) for run in runs] == [(0, 2), (2, 2)]
+    configs = grid((0, 1, 2, 3), 2)
+    runs = [configs[run] for run in ("hopper-ppo-0-1", "hopper-ppo-2-3")]
+    assert [(config.seed, config.num_seeds) for config in runs] == [(0, 2), (2, 2)]
     with pytest.raises(ConfigError, match=r"seeds_per_run 2: must be 1, .* not \[0, 2\]"):
         grid((0, 2, 3, 4), 2)
 
 
 def test_a_variant_names_the_run_instead_of_the_algorithm():
     (run,) = sweeps.grid(["brax:ant"], ["kappa-0.1"], (3, 4), 2, lambda *_: make("ant", "dppo"))
-    assert run.name == "brax_ant-kappa-0.1-3-4"
-    (run,) = sweeps.grid(["ant"], ["kappa-0.1"], (3, 4), 2, make=lambda *_: make("ant", "dppo"))
-    assert run.label == "kappa-0.1"
+    assert run == "brax_ant-kappa-0.1-3-4"
+    (run,) = sweeps.grid(["ant"], ["kappa-0.1"], (3, 4), 2, lambda *_: make("ant", "dppo")).items()
+    assert sweeps.label_of(*run) == "kappa-0.1"
 
 
 @pytest.mark.parametrize("question", VARIANTS)
 def test_every_variant_is_a_configuration_of_its_own(question):
     configs = {
         name: resolve(make("hopper", algo).as_config().replace(**changes))
-        for name, (algo, changes) in variants(question).items()
+        for name, (algo, changes) in VARIANTS[question].items()
     }
     assert len({str(config) for config in configs.values()}) == len(configs)
     for name, config in configs.items():
@@ -66,7 +62,7 @@ def test_a_sweep_keeps_its_runs_and_the_commands_that_asked_for_them(tmp_path):
         pass
     with sweeps.opened(tmp_path / "sweep", grid((0, 1)), "two") as sweep:
         assert sweep == sweeps.read(tmp_path / "sweep")
-    assert names(sweep.runs) == names(grid((0, 1)))
+    assert list(sweep.runs) == list(grid((0, 1)))
     assert (sweep.commands["ant-ppo-0"], sweep.commands["ant-ppo-1"]) == ("one", "two")
 
 
@@ -84,7 +80,7 @@ def test_another_configuration_of_a_run_is_refused(tmp_path):
 def test_a_directory_in_use_or_of_something_else_is_refused(tmp_path):
     with sweeps.opened(tmp_path / "sweep", grid(), "one"):
         message = "must not be in use"
-        with pytest.raises(ConfigError, match=message), sweeps.opened(tmp_path / "sweep", [], ""):
+        with pytest.raises(ConfigError, match=message), sweeps.opened(tmp_path / "sweep", {}, ""):
             pass
     message = "must be a sweep, or a new or empty directory"
     with pytest.raises(ConfigError, match=message), sweeps.opened(tmp_path, grid(), ""):
@@ -95,7 +91,7 @@ def test_a_directory_in_use_or_of_something_else_is_refused(tmp_path):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (lambda data: data | {"schema": 2}, "schema 2: must be 1"),
+        (lambda data: data | {"schema": 2}, "its schema is 2, not 1"),
         (lambda data: data | {"cells": {"../x": data["cells"]["ant-ppo-0"]}}, "cannot be the name"),
         (lambda data: data | {"cells": [1]}, "must be a sweep that can be read"),
         (lambda data: {}, "must be a sweep that can be read"),
@@ -118,10 +114,10 @@ def test_a_committed_sweep_is_read_and_its_runs_are_done(path):
     rows = reproduce.read_results(sweep)
     committed = metrics.read(path / "results.jsonl")
     assert rows.keys() == {row["cell"] for row in committed}
-    for run in sweep.runs:
-        expected = [row for row in committed if row["cell"] == run.name]
-        assert rows.get(run.name, []) == expected
-        assert all(differences(from_dict(row["config"]), run.config) == {} for row in expected)
+    for run, config in sweep.runs.items():
+        expected = [row for row in committed if row["cell"] == run]
+        assert rows.get(run, []) == expected
+        assert all(differences(from_dict(row["config"]), config) == {} for row in expected)
 
 
 def test_a_long_curve_is_averaged_to_two_hundred_points():
