@@ -6,7 +6,6 @@ Importing this loads no task: names are checked before JAX, MuJoCo and Brax are 
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from importlib.util import find_spec
-from pkgutil import resolve_name
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from dgae_jax.physics.registry import ENGINES
@@ -21,8 +20,6 @@ CUSTOM_ENVS: dict[str, Any] = {}
 class EnvSpec(NamedTuple):
     """A task that can be built and evaluated."""
 
-    builder: str
-    """Where the function or class is that builds it."""
     engines: tuple[str, ...]
     """Engines that the task runs on; the first is the default."""
     eval_envs: Mapping[str, str] = {}
@@ -47,18 +44,16 @@ class EnvSpec(NamedTuple):
 
 TASKS = {
     name.lower(): EnvSpec(
-        "dgae_jax.envs.gym_tasks:make_gym_task",
-        tuple(ENGINES),
-        {version: f"{name}-{version}" for version in ("v4", "v5")},
+        tuple(ENGINES), {version: f"{name}-{version}" for version in ("v4", "v5")}
     )
     for name in ("Ant", "Hopper", "Swimmer", "Walker2d")
 }
 
 _THIRD_PARTY = {
-    "brax": EnvSpec("dgae_jax.envs.custom:make_brax", ("mjx",)),
-    "playground": EnvSpec("dgae_jax.envs.playground:make_playground", ("mjx", "mjx-warp")),
-    "gymnasium": EnvSpec("dgae_jax.envs.gymnasium:GymnasiumTask", ("gymnasium",)),
-    "custom": EnvSpec("dgae_jax.envs.custom:make_custom", ("custom",)),
+    "brax": EnvSpec(("mjx",)),
+    "playground": EnvSpec(("mjx", "mjx-warp")),
+    "gymnasium": EnvSpec(("gymnasium",)),
+    "custom": EnvSpec(("custom",)),
 }
 """Third-party tasks by the prefix of their names."""
 
@@ -143,5 +138,16 @@ def make_env(
         raise ValueError(f"version {version}: must be {allowed}")
     if spec.eval_envs:
         task_parameters["version"] = version
-    own_name = name.partition(":")[2] or name
-    return resolve_name(spec.builder)(own_name, engine, **task_parameters)
+    kind, _, own_name = name.rpartition(":")
+    match kind:
+        case "brax":
+            from dgae_jax.envs.custom import make_brax as build
+        case "custom":
+            from dgae_jax.envs.custom import make_custom as build
+        case "gymnasium":
+            from dgae_jax.envs.gymnasium import GymnasiumTask as build
+        case "playground":
+            from dgae_jax.envs.playground import make_playground as build
+        case _:
+            from dgae_jax.envs.gym_tasks import make_gym_task as build
+    return build(own_name, engine, **task_parameters)

@@ -4,8 +4,7 @@ Importing this loads no engine: names are checked before JAX or MuJoCo are impor
 """
 
 from importlib.util import find_spec
-from pkgutil import resolve_name
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     import mujoco
@@ -13,26 +12,13 @@ if TYPE_CHECKING:
     from dgae_jax.physics.engine import Physics, Reads
 
 
-class Engine(NamedTuple):
-    """An engine, and what it needs."""
-
-    builder: str
-    """Where the function is that builds it."""
-    package: str | None = None
-    """Name of the module needed, which is also the name of our extra."""
-
-
-ENGINES = {
-    "jax": Engine("dgae_jax.physics.jax.forward:jax_engine"),
-    "mjx": Engine("dgae_jax.physics.mjx:mjx"),
-    "mjx-warp": Engine("dgae_jax.physics.mjx:mjx_warp", package="warp"),
-    "native": Engine("dgae_jax.physics.native:native"),
-}
+ENGINES: dict[str, str | None] = {"jax": None, "mjx": None, "mjx-warp": "warp", "native": None}
+"""The engines, and the module that each needs beyond our dependencies: the name of our extra."""
 
 
 def require(name: str) -> None:
     """Raise ValueError if the package of an engine is not installed."""
-    package = ENGINES[name].package
+    package = ENGINES[name]
     if package is not None and find_spec(package) is None:
         reason = f"needs the package {package}, which is not installed"
         raise ValueError(f'physics {name} {reason}: pip install "dgae_jax[{package}]"')
@@ -45,4 +31,13 @@ def make_physics(name: str, spec: "mujoco.MjSpec", frame_skip: int, reads: "Read
         ValueError: if the engine is not installed, or does not cover the model.
     """
     require(name)
-    return resolve_name(ENGINES[name].builder)(spec, frame_skip, reads)
+    from dgae_jax.physics import mjx, native
+    from dgae_jax.physics.jax import forward
+
+    builders = {
+        "jax": forward.jax_engine,
+        "mjx": mjx.mjx,
+        "mjx-warp": mjx.mjx_warp,
+        "native": native.native,
+    }
+    return builders[name](spec, frame_skip, reads)
