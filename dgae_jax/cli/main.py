@@ -39,6 +39,7 @@ def command(name: str) -> parse.Command:
 
 def main() -> int:
     """Run one command."""
+    terminal.prepare()
     words = sys.argv[1:] or ["--help"]
     name, _, shell = words[0].partition("=")
     if words[0] in COMMANDS:

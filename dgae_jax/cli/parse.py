@@ -202,6 +202,7 @@ class Command(NamedTuple):
 
     def __call__(self) -> int:
         """Run on the command line of this process, and return the exit code."""
+        terminal.prepare()
         try:
             return self.work(self.read(sys.argv[1:])) or 0
         except ConfigError as mistake:

@@ -1,13 +1,12 @@
 """Brax's own environments, and custom ones that are given as objects."""
 
 import warnings
-from typing import Any
 
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from dgae_jax.envs.base import Env, Wrapper, brax
+from dgae_jax.envs.env_checker import check_env
 from dgae_jax.envs.registry import CUSTOM_ENVS
 
 
@@ -36,11 +35,7 @@ def make_custom(name: str, physics: str) -> CustomTask:
     env = CUSTOM_ENVS[f"custom:{name}"]
     if not isinstance(env, Env):
         raise ValueError(f"{name} is not a brax.envs.base.Env")
-    state: Any = jax.eval_shape(env.reset, jax.random.key(0))
-    for part, shape in (("obs", (env.observation_size,)), ("reward", ()), ("done", ())):
-        value = getattr(state, part)
-        if getattr(value, "shape", None) != shape:
-            raise ValueError(f"{part} of {name} is {value}, and must be an array of shape {shape}")
+    check_env(env)
     return CustomTask(env)
 
 

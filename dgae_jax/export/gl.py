@@ -42,7 +42,11 @@ def choose() -> str:
 
 @functools.cache
 def works(backend: str) -> bool:
-    """Return whether MuJoCo can draw with this backend."""
+    """Return whether MuJoCo can draw with this backend, within a minute."""
     environment = {**os.environ, VARIABLE: backend}
     command = [sys.executable, "-c", _TRIAL]
-    return subprocess.run(command, env=environment, capture_output=True).returncode == 0
+    try:
+        subprocess.run(command, env=environment, capture_output=True, timeout=60, check=True)
+    except subprocess.SubprocessError:
+        return False
+    return True

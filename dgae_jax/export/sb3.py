@@ -53,6 +53,10 @@ class Sb3VecEnv(VecEnv):
         """Close the environment."""
         self.env.close()
 
+    def get_images(self) -> list[Any]:
+        """Return a picture of each env."""
+        return list(self.env.render() or ())
+
     def get_attr(self, attr_name: str, indices=None) -> list[Any]:
         """Return an attribute, which all envs share, once for each of `indices`."""
         return [getattr(self.env, attr_name) for _ in self._get_indices(indices)]

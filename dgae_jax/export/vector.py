@@ -137,6 +137,10 @@ class VectorTask(VectorEnv):
         if isinstance(seed, int | np.integer):
             seeds = [int(seed) + i for i in range(count)]
         mask = np.asarray((options or {}).get("reset_mask", [True] * count))
+        if len(seeds) != count:
+            raise invalid("seed", seed, f"a number, or a list of {count}")
+        if mask.shape != (count,) or mask.dtype != bool:
+            raise invalid("reset_mask", mask, f"{count} booleans")
         given = jnp.asarray(mask & [s is not None for s in seeds])
         keys = where(given, _keys_of([s or 0 for s in seeds]), self._states.keys)
         self._states = self._reset(self._states._replace(keys=keys), mask)
@@ -216,6 +220,8 @@ def make_vector_env(
     Raises:
         ValueError: an argument is invalid; the message names what is allowed.
     """
+    if num_envs < 1:
+        raise invalid("num_envs", num_envs, "at least 1")
     if render_mode is not None and (render_mode != "rgb_array" or name not in CAMERAS):
         allowed = f"left out, or rgb_array with {', '.join(CAMERAS)}"
         raise invalid("render_mode", render_mode, allowed)

@@ -82,13 +82,6 @@ class TrainState(NamedTuple):
     """Iterations in a row with a skipped update, or with most env steps masked."""
 
 
-Loss = Callable[[Params, Any], tuple[Float[Array, ""], Metrics]]
-"""`loss(params, batch)`: mean loss of a batch, and scalars worth logging."""
-Residual = Callable[[Steps, Steps, Quantiles, Quantiles], Steps]
-"""`residual(reward, discount, quantiles, next_quantiles)`: TD error δ from the predictions before
-and after each step; the part that DGAE changes."""
-
-
 @runtime_checkable
 class TargetFn(Protocol):
     """Targets [T, N, J] of a critic's fit, from predictions of the critic at rollout time.
@@ -105,6 +98,31 @@ class TargetFn(Protocol):
         quantiles: Quantiles | None,
         next_quantiles: Quantiles,
     ) -> Float[Array, "*steps J"]: ...
+
+
+@runtime_checkable
+class Loss(Protocol):
+    """Mean loss of a batch, and scalars worth logging."""
+
+    def __call__(self, params: Params, batch: Any) -> tuple[Float[Array, ""], Metrics]: ...
+
+
+@runtime_checkable
+class Residual(Protocol):
+    """TD error δ from the predictions before and after each step: the part that DGAE changes."""
+
+    def __call__(
+        self, reward: Steps, discount: Steps, quantiles: Quantiles, next_quantiles: Quantiles
+    ) -> Steps: ...
+
+
+@runtime_checkable
+class UpdateStep(Protocol):
+    """One iteration's update of a network, and scalars worth logging."""
+
+    def __call__(
+        self, key: Key[Array, ""], state: TrainableState, batch: Any
+    ) -> tuple[TrainableState, Metrics]: ...
 
 
 class Network(NamedTuple):
@@ -133,8 +151,7 @@ class Update(NamedTuple):
 
     init: Callable[[Params], Any]
     """`init(params) -> opt_state`."""
-    step: Callable[[Key[Array, ""], TrainableState, Any], tuple[TrainableState, Metrics]]
-    """`step(key, state, batch)`: the update of one iteration, and scalars worth logging."""
+    step: UpdateStep
 
 
 class Algorithm(NamedTuple):

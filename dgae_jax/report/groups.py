@@ -10,6 +10,7 @@ import numpy as np
 
 from dgae_jax.configs.algorithms import ALGORITHMS
 from dgae_jax.envs.registry import TASKS
+from dgae_jax.maths.statistics import sample_cvar
 from dgae_jax.report.results import Row
 
 
@@ -35,6 +36,11 @@ class Group:
     def finals(self) -> np.ndarray:
         """Mean returns [S] of the final policies."""
         return np.array([row.final for row in self.rows])
+
+    @property
+    def worst(self) -> np.ndarray:
+        """Mean returns [S] of the worst quarter of the final policies' episodes."""
+        return np.array([sample_cvar(row.returns, 0.25) for row in self.rows])
 
     @property
     def averages(self) -> np.ndarray:

@@ -31,6 +31,8 @@ class Row:
     engine: str
     final: float
     """Mean return of the final policy in `engine`."""
+    returns: np.ndarray
+    """Returns [E] of the final policy's episodes."""
     best: float | None
     """Mean return of the best checkpoint; None without evaluations during training."""
     curve_steps: np.ndarray
@@ -127,6 +129,7 @@ PATHS = {
     "run": "cell",
     "engine": "final.engine",
     "final": "final.return_mean",
+    "returns": "final.returns",
     "best": "best.return_mean",
     "curve_steps": "curve.steps",
     "curve_returns": "curve.return",

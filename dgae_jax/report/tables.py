@@ -48,11 +48,29 @@ def returns(groups: Iterable[Group]) -> Table:
     for group in groups:
         best = [row.best for row in group.rows if row.best is not None]
         seeds = " · ".join(number(value) for value in group.finals)
-        scores = spread(group.finals), between(analysis.interquartile_mean(group.finals))
-        size = str(len(group.rows))
-        rows.append((group.task, group.name, size, *scores, spread(best) if best else NONE, seeds))
+        rows.append((*_key(group), *_scores(group.finals), spread(best) if best else NONE, seeds))
     names = ("task", "algorithm", "seeds", "mean ± std", IQM, "best checkpoint", "each seed")
     return Table(names, rows)
+
+
+def attribution(groups: Iterable[Group]) -> Table:
+    """Variants against the first of their task, by final return and by the mean during training.
+
+    The mean during training depends less on where the run ends.
+    """
+    rows = []
+    for members in by_task(groups).values():
+        first = members[0]
+        for group in members:
+            pairs = (first.finals, group.finals), (first.averages, group.averages)
+            texts = [
+                (spread(ours), NONE if group is first else _difference(theirs, ours))
+                for theirs, ours in pairs
+            ]
+            rows.append((*_key(group), *texts[0], *texts[1]))
+    different = "difference from the first [95 %]"
+    end, run = "at the end, mean ± std", "over the run, mean ± std"
+    return Table(("task", "variant", "seeds", end, different, run, different), rows)
 
 
 def attribution_over_tasks(groups: Iterable[Group]) -> Table:
@@ -70,6 +88,13 @@ def attribution_over_tasks(groups: Iterable[Group]) -> Table:
         rows.append((name, str(len(pairs)), str(seeds), *shares))
     above = [f"above the first {when} [95 %]" for when in ("at the end", "over the run")]
     return Table(("variant", "tasks", "seeds", *above), rows, keys=1)
+
+
+def risk(groups: Iterable[Group]) -> Table:
+    """Final returns: the mean over episodes, and the mean of their worst quarter (CVaR)."""
+    rows = [(*_key(group), *_scores(group.finals), *_scores(group.worst)) for group in groups]
+    header = ("task", "variant", "seeds", "mean ± std", IQM, "worst quarter ± std", IQM)
+    return Table(header, rows)
 
 
 def reach(groups: Iterable[Group]) -> Table:
@@ -124,15 +149,24 @@ def comparison(first: Iterable[Group], second: Iterable[Group], names: tuple[str
     )
     rows, either = [], {**ours, **theirs}
     for key in sorted(either, key=lambda key: order(either[key].rows[0])):
-        finals = [groups[key].finals for groups in (ours, theirs) if key in groups]
-        means = [
-            between(analysis.interquartile_mean(groups[key].finals)) if key in groups else NONE
-            for groups in (ours, theirs)
-        ]
-        change = between(analysis.difference(*finals), "{:+,.0f}") if len(finals) == 2 else NONE
-        rows.append((*key, *means, change))
+        finals = [groups[key].finals if key in groups else None for groups in (ours, theirs)]
+        means = [NONE if x is None else between(analysis.interquartile_mean(x)) for x in finals]
+        one, two = finals
+        rows.append((*key, *means, NONE if one is None or two is None else _difference(one, two)))
     columns = [f"{name}, {IQM}" for name in names]
     return Table(("task", "algorithm", *columns, "difference [95 %]"), rows)
+
+
+def _key(group: Group) -> tuple[str, str, str]:
+    return group.task, group.name, str(len(group.rows))
+
+
+def _scores(scores: np.ndarray) -> tuple[str, str]:
+    return spread(scores), between(analysis.interquartile_mean(scores))
+
+
+def _difference(first: np.ndarray, second: np.ndarray) -> str:
+    return between(analysis.difference(first, second), "{:+,.0f}")
 
 
 def number(value: float, form: str = "{:,.0f}") -> str:
@@ -166,7 +200,9 @@ TABLES: dict[str, Callable[[Sequence[Group]], Table]] = {
     "iqm": interquartile_means,
     "returns": returns,
     "improvement": lambda groups: improvement(analysis.improvements(groups)),
+    "attribution": attribution,
     "attribution-over-tasks": attribution_over_tasks,
+    "risk": risk,
     "reach": reach,
     "speed": speed,
 }

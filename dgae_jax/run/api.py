@@ -5,7 +5,7 @@ import shutil
 import tempfile
 import uuid
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple, Unpack
 
 import jax
 import numpy as np
@@ -17,7 +17,7 @@ from dgae_jax.envs.registry import custom_env
 from dgae_jax.learn.build import make_greedy, make_quantiles, make_task
 from dgae_jax.learn.types import InferenceState
 from dgae_jax.run import checkpoint, directory, metrics, terminal, training
-from dgae_jax.run.options import RunOptions
+from dgae_jax.run.options import RunOptions, TrainOptions
 
 
 class Policy:
@@ -75,7 +75,7 @@ def train(
     *,
     env: Env | None = None,
     quiet: bool = False,
-    **options: Any,
+    **options: Unpack[TrainOptions],
 ) -> Run:
     """Train and evaluate a run, as the command line does.
 

@@ -20,7 +20,7 @@ from dgae_jax.configs.config import ConfigError, invalid
 from dgae_jax.configs.resolved import ResolvedConfig, resolve
 from dgae_jax.configs.serial import flat, from_dict, to_dict
 from dgae_jax.run import files, terminal
-from dgae_jax.run.options import SAVED, RunOptions
+from dgae_jax.run.options import RunOptions, SavedOptions
 
 VERSIONED = (
     "dgae_jax", "jax", "jaxlib", "flax", "optax", "brax", "mujoco", "mujoco-mjx", "playground",
@@ -145,7 +145,9 @@ def continue_run(run_dir: Path, config: ResolvedConfig, options: RunOptions) -> 
 def saved_options(run_dir: Path) -> RunOptions:
     """Return the options of the last part of the run that a resume keeps."""
     found = last_part(run_dir).get("options", {})
-    return RunOptions(**{name: found[name] for name in SAVED if name in found})
+    return RunOptions(
+        **{name: found[name] for name in SavedOptions.__annotations__ if name in found}
+    )
 
 
 def environment_changes(run_dir: Path, options: RunOptions) -> list[str]:
@@ -176,7 +178,7 @@ def _part(options: RunOptions) -> dict[str, Any]:
         "platform": platform.platform(),
         **runtime.hardware(),
         "versions": {name: _version(name) for name in VERSIONED},
-        "options": {name: getattr(options, name) for name in SAVED},
+        "options": {name: getattr(options, name) for name in SavedOptions.__annotations__},
     }
 
 

@@ -3,6 +3,7 @@
 import importlib.util
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TypedDict
 
 from dgae_jax.configs.config import ConfigError, invalid
 from dgae_jax.configs.resolved import ResolvedConfig
@@ -57,11 +58,29 @@ class RunOptions:
         object.__setattr__(self, "log", tuple(dict.fromkeys(self.log)))  # perhaps a list
 
 
-SAVED = (
-    *("devices", "checkpoint_every", "keep_checkpoints", "max_nonfinite"),
-    *("eval_engine", "episodes", "debug_nonfinite", "log"),
-)
-"""Options that a resumed run keeps."""
+class SavedOptions(TypedDict, total=False):
+    """Options that a resumed run keeps."""
+
+    devices: int | None
+    checkpoint_every: int
+    keep_checkpoints: int
+    max_nonfinite: int
+    eval_engine: str | None
+    episodes: int
+    debug_nonfinite: bool
+    log: tuple[str, ...]
+
+
+class TrainOptions(SavedOptions, total=False):
+    """Keyword options of `dgae_jax.train`: fields of `RunOptions`."""
+
+    cache_dir: str
+    coordinator: str | None
+    num_processes: int | None
+    process_id: int | None
+    resume_or_start: bool
+    inexact: bool
+
 
 COUNTS = ("devices", "checkpoint_every", "keep_checkpoints", "max_nonfinite", "episodes")
 

@@ -21,6 +21,18 @@ PICTURE_SECONDS = 4.0
 _silent: ContextVar[bool] = ContextVar("silent", default=False)
 
 
+def prepare() -> None:
+    """Make the standard streams harmless; the first thing that a command does.
+
+    Closed streams (`>&-`) are opened on /dev/null, so that no file of the run takes their place.
+    """
+    for name, mode in (("stdin", "r"), ("stdout", "w"), ("stderr", "w")):
+        if getattr(sys, name) is None:  # the lowest free number is that of this stream
+            nothing = os.open(os.devnull, os.O_RDWR)
+            os.set_inheritable(nothing, True)
+            setattr(sys, name, open(nothing, mode))  # noqa: PTH123, SIM115
+
+
 def say(text: str) -> None:
     """Print a line, unless silenced."""
     if not _silent.get():
@@ -51,7 +63,9 @@ def is_live() -> bool:
 
 def in_notebook() -> bool:
     """Return whether this process is the kernel of a notebook and not silenced."""
-    return "ipykernel" in sys.modules and not _silent.get()
+    ipython: Any = sys.modules.get("IPython")
+    shell = ipython.get_ipython() if ipython else None
+    return getattr(shell, "kernel", None) is not None and not _silent.get()
 
 
 def write(stream: Any, text: str) -> None:

@@ -223,7 +223,8 @@ def _iterate(
             state = trainer.init(config, seed_keys(config))
         if done < config.iterations:
             compile_in_thread(trainer.dispatch, config, state, 1, watch=watch)
-        most, count, seconds = runtime.gather(state.failures).max(), 1, 0.0
+        failures = runtime.gather(state.failures)
+        most, count, seconds = failures.max(), 1, 0.0
         stopping = signals.anywhere()
         while True:
             if most >= options.max_nonfinite:
@@ -243,7 +244,7 @@ def _iterate(
             state, measured = trainer.dispatch(config, state, count)
             measured = runtime.gather(measured)
             mean_return = logger.append(state, measured, count)
-            most = runtime.gather(state.failures).max()
+            failures, most = _count_failures(failures, measured, count, samples)
             seconds, done = (time.monotonic() - since) / count, done + count
             if warm:  # the first dispatch says nothing about speed
                 reporter.update(done * samples, samples / seconds, mean_return)
@@ -252,3 +253,15 @@ def _iterate(
             stopping = signals.anywhere()
             if stopping or last or done % every == 0:
                 logger.save(state)
+
+
+def _count_failures(
+    failures: np.ndarray, measured: dict[str, Any], count: int, samples: int
+) -> tuple[np.ndarray, int]:
+    """Return failed iterations in a row [S] after `count` more, and the most on the way there."""
+    most = 0
+    for i in range(count):
+        failed = (measured["skipped"][i] > 0) | (measured["nonfinite"][i] > samples / 2)
+        failures = np.where(failed, failures + 1, 0)
+        most = max(most, int(failures.max()))
+    return failures, most

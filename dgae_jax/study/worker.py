@@ -75,6 +75,7 @@ def _stop_when_abandoned() -> None:
 
 
 if __name__ == "__main__":
+    terminal.prepare()
     if cores := sys.argv[3:]:
         os.sched_setaffinity(0, map(int, cores))
     threading.Thread(target=_stop_when_abandoned, daemon=True).start()
