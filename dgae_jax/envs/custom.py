@@ -1,13 +1,13 @@
 """Brax's own environments, and custom ones that are given as objects."""
 
 import warnings
+from typing import Any
 
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from dgae_jax.envs.base import Env, Wrapper, brax
 from dgae_jax.envs.env_checker import check_env
-from dgae_jax.envs.registry import CUSTOM_ENVS
 
 
 class CustomTask(Wrapper):
@@ -26,15 +26,10 @@ def with_range(env: Env) -> Env:
     return env if hasattr(env, "action_range") else CustomTask(env)
 
 
-def make_custom(name: str, physics: str) -> CustomTask:
-    """Wrap the env that was registered as `custom:NAME`.
-
-    Raises:
-        ValueError: if the trainer cannot take it.
-    """
-    env = CUSTOM_ENVS[f"custom:{name}"]
+def make_custom(env: Any) -> CustomTask:
+    """Check and wrap an env; raise ValueError if the trainer cannot take it."""
     if not isinstance(env, Env):
-        raise ValueError(f"{name} is not a brax.envs.base.Env")
+        raise ValueError(f"{type(env).__name__} is not a brax.envs.base.Env")
     check_env(env)
     return CustomTask(env)
 

@@ -138,16 +138,18 @@ def make_env(
         raise ValueError(f"version {version}: must be {allowed}")
     if spec.eval_envs:
         task_parameters["version"] = version
-    kind, _, own_name = name.rpartition(":")
+    kind, _, own_name = name.partition(":")
     match kind:
         case "brax":
             from dgae_jax.envs.custom import make_brax as build
         case "custom":
-            from dgae_jax.envs.custom import make_custom as build
+            from dgae_jax.envs.custom import make_custom
+
+            return make_custom(CUSTOM_ENVS[name], **task_parameters)
         case "gymnasium":
             from dgae_jax.envs.gymnasium import GymnasiumTask as build
         case "playground":
             from dgae_jax.envs.playground import make_playground as build
         case _:
             from dgae_jax.envs.gym_tasks import make_gym_task as build
-    return build(own_name, engine, **task_parameters)
+    return build(own_name or name, engine, **task_parameters)

@@ -35,7 +35,7 @@ class Torso(nn.Module):
 
 
 class Value(nn.Module):
-    """Hidden layers and a linear head with initial biases `bias`."""
+    """Hidden layers and a linear head with initial biases `bias` (Sec. results, set-up)."""
 
     hidden: Sequence[int]
     outputs: int
@@ -48,7 +48,7 @@ class Value(nn.Module):
 
 
 class SharedCovariance(nn.Module):
-    """Mean from the observation, one learned log σ for all observations."""
+    """Mean from the observation, one log σ for all observations (Sec. results, set-up)."""
 
     hidden: Sequence[int]
     actions: int

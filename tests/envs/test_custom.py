@@ -24,15 +24,24 @@ class TwoAxes(Bare):
     observation_size = 3
 
 
+class Named(Bare):
+    def reset(self, rng):
+        state = super().reset(rng)
+        return state.replace(obs={"state": state.obs})
+
+    def step(self, state, action):
+        return state
+
+
 class Replacing(Bare):
-    """Its resets replace fields of the state."""
+    """Its steps replace fields of the state."""
 
     def __init__(self, **fields):
         super().__init__()
         self.fields = fields
 
-    def reset(self, rng):
-        return super().reset(rng).replace(**self.fields)
+    def step(self, state, action):
+        return super().step(state, action).replace(**self.fields)
 
 
 def act(keys, obs):
@@ -55,9 +64,11 @@ def test_actions_lie_in_the_unit_box_by_default():
     ("env", "reason"),
     [
         (3, "int is not a brax.envs.base.Env"),
-        (TwoAxes(), r"obs of TwoAxes is .*, and must be an array of shape \(3,\)"),
-        (Replacing(obs={"state": jnp.zeros(2)}), r"obs of Replacing is {'state'.* shape \(2,\)"),
-        (Replacing(reward=jnp.ones(1)), r"reward of Replacing is .*, and must be .* shape \(\)"),
+        (TwoAxes(), r"the observation of its reset has shape float32\[2\]"),
+        (Named(), r"the observation of its reset has shape state: float32\[2\]"),
+        (Replacing(info={"x": jnp.zeros(3)}), r"its step turns state.info\['x'\] from nothing"),
+        (Replacing(reward=jnp.int32(1)), "the reward of its step is .*int32"),
+        (Replacing(wind=1), r"its step cannot be compiled by JAX \(TypeError: .*wind"),
     ],
 )
 def test_invalid_env_is_refused_with_the_reason(env, reason):

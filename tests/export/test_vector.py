@@ -176,6 +176,7 @@ def test_gymnasium_makes_it_by_name():
     ("options", "message"),
     [
         ({"name": "hoper"}, "environment hoper: must be one of ant"),
+        ({"num_envs": 0}, "num_envs 0: must be at least 1"),
         ({"autoreset_mode": "Never"}, "'Never' is not a valid AutoresetMode"),
         ({"render_mode": "human"}, "render_mode human: must be left out, or rgb_array"),
         ({"name": "gymnasium:Pendulum-v1", "physics": None}, "name gymnasium:.*a task in JAX"),
@@ -191,8 +192,10 @@ def test_invalid_steps_and_resets_are_refused():
     still = np.zeros((3, 3), np.float32)
     with pytest.raises(ResetNeeded, match=r"envs \[0 1 2\] are in no episode"):
         env.step(still)
-    with pytest.raises(ValueError, match="could not be broadcast"):
+    with pytest.raises(ValueError, match=r"seed \[1, 2\]: must be a number, or a list of 3"):
         env.reset(seed=[1, 2])
+    with pytest.raises(ValueError, match=r"reset_mask .*: must be 3 booleans"):
+        env.reset(options={"reset_mask": np.ones(3)})
     env.reset()
     with pytest.raises(ValueError, match=r"^actions of \(3, 2\): must be of shape \(3, 3\)"):
         env.step(still[:, :2])
