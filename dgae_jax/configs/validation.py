@@ -6,6 +6,7 @@ Values that are traced by JAX are not known yet and pass unchecked.
 import dataclasses
 import sys
 from collections.abc import Callable, Mapping
+from functools import partial
 from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 from dgae_jax.configs import parts
@@ -128,7 +129,7 @@ def check(config: Config, spec: EnvSpec) -> None:
         name = path.rpartition(".")[2]
         if name in RANGES:
             low, high, allowed = RANGES[name]
-            _require(config, path, lambda x: low <= x <= high, allowed)  # noqa: B023  called at once
+            _require(config, path, partial(_within, low, high), allowed)
         if name in CHOICES:
             _require(config, path, CHOICES[name].__contains__, f"one of {', '.join(CHOICES[name])}")
     highest = 2**32 - config.num_seeds
@@ -137,6 +138,10 @@ def check(config: Config, spec: EnvSpec) -> None:
     _check_networks(config)
     _check_metric(config)
     _check_samples(config)
+
+
+def _within(low: float, high: float, value: Any) -> bool:
+    return low <= value <= high
 
 
 def _require(config: Config, path: str, ok: Callable[[Any], bool], allowed: str) -> None:
