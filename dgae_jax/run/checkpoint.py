@@ -230,7 +230,8 @@ def reward_std(path: Path, config: ResolvedConfig) -> np.ndarray:
 def reset_episodes(state: TrainState, config: ResolvedConfig) -> TrainState:
     """Return the training state with every env at the start of an episode."""
     keys = jax.vmap(jax.random.fold_in)(seed_keys(config), state.iteration)
-    new = make_trainer(make_task(config), 1).init(config, keys).episodes
+    task = make_task(config)  # lives until its envs have begun their episodes
+    new = jax.block_until_ready(make_trainer(task, 1).init(config, keys).episodes)
     episodes = state.episodes._replace(env=new.env, steps=new.steps, total=new.total)
     scale = state.reward_scale._replace(discounted=jnp.zeros_like(state.reward_scale.discounted))
     return state._replace(episodes=episodes, reward_scale=scale)
