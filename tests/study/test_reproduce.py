@@ -191,7 +191,7 @@ def test_submitit_runs_a_sweep(longer, tmp_path):
         "import shutil, submitit; from dgae_jax.cli.reproduce import reproduce\n"
         "Auto = submitit.AutoExecutor\n"
         "submitit.AutoExecutor = lambda folder, _: Auto(folder, 'local')\n"
-        "shutil.which = str; raise SystemExit(reproduce())"
+        "shutil.which = lambda name, *_, **__: name; raise SystemExit(reproduce())"
     )
     more = ["--launcher", "slurm"]
     studies.succeed(studies.start(tmp_path, *more, steps=400, program=("-c", program)))
