@@ -38,7 +38,8 @@ def test_importing_prints_nothing_and_is_light():
     program = f"""
 import sys; sys.modules['warp'] = None
 import dgae_jax; assert not {heavy} & set(sys.modules)
-import dgae_jax.envs.brax, dgae_jax.run.api"""
+import dgae_jax.envs.brax, dgae_jax.run.api
+import mujoco; assert mujoco.get_mju_user_warning() is None"""
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
     assert (done.returncode, done.stdout) == (0, ""), done.stderr
 

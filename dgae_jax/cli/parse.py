@@ -209,7 +209,6 @@ class Command(NamedTuple):
             fail(mistake)
         except KeyboardInterrupt:
             terminal.warn("stopped by SIGINT")
-            sys.stdout.flush()
             os._exit(130)  # Python would wait for XLA, or abort it
 
 

@@ -8,6 +8,7 @@ from jaxtyping import Array, Float
 
 from dgae_jax.envs.base import Env, Wrapper, brax
 from dgae_jax.envs.env_checker import check_env
+from dgae_jax.physics.engine import silence_warnings
 
 
 class CustomTask(Wrapper):
@@ -36,6 +37,7 @@ def make_custom(env: Any) -> CustomTask:
 
 def make_brax(name: str, physics: str, **parameters) -> Env:
     """Build one of Brax's own environments on its MJX backend, with actions in [−1, 1]."""
+    silence_warnings()
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # of features of the model files that Brax leaves out

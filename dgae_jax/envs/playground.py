@@ -11,6 +11,7 @@ from brax.envs.wrappers.training import EpisodeWrapper
 from jaxtyping import Array, Float
 
 from dgae_jax.envs.base import Env, State, ThirdPartyEnv
+from dgae_jax.physics.engine import silence_warnings
 from dgae_jax.physics.registry import require
 
 
@@ -51,6 +52,7 @@ def _state(inner: Any) -> State:
 def make_playground(name: str, physics: str, **parameters) -> Env:
     """Build a task of Playground, if possible; `parameters` override its configuration."""
     require(physics)
+    silence_warnings()
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         from mujoco_playground import dm_control_suite, registry  # pyright: ignore

@@ -40,7 +40,7 @@ def make_trainer(env: Env, capacity: int, mesh: Mesh | None = None) -> Trainer:
         mesh: the devices that share the work (`devices.make_mesh`); by default there is one.
 
     Returns:
-        Programs whose configurations may change in their traced leaves between calls.
+        Programs; the traced leaves of their configurations may change between calls.
     """
 
     def functions(config: ResolvedConfig) -> tuple[InitFn, TrainStep]:

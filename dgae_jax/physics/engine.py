@@ -13,9 +13,6 @@ import jax.numpy as jnp
 import mujoco
 from jaxtyping import Array, Float
 
-if mujoco.get_mju_user_warning() is None:  # they would be printed and written to MUJOCO_LOG.TXT
-    mujoco.set_mju_user_warning(lambda message: None)
-
 
 class Reads(NamedTuple):
     """The quantities that a task reads besides positions and velocities."""
@@ -67,6 +64,12 @@ class Physics(NamedTuple):
         xpos = qpos[..., None, :3] if self.reads.xpos else jnp.zeros((*batch, 0, 3), qpos.dtype)
         forces = jnp.zeros((*batch, bodies, 6), qpos.dtype)
         return PhysicsState(qpos, qvel, jnp.zeros_like(qvel), xpos, forces)
+
+
+def silence_warnings() -> None:
+    """Keep MuJoCo from printing warnings and writing MUJOCO_LOG.TXT, unless the user has a way."""
+    if mujoco.get_mju_user_warning() is None:
+        mujoco.set_mju_user_warning(lambda message: None)
 
 
 def refuse_hidden_state(model: mujoco.MjModel, name: str) -> None:

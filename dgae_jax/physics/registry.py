@@ -31,9 +31,10 @@ def make_physics(name: str, spec: "mujoco.MjSpec", frame_skip: int, reads: "Read
         ValueError: if the engine is not installed, or does not cover the model.
     """
     require(name)
-    from dgae_jax.physics import mjx, native
+    from dgae_jax.physics import engine, mjx, native
     from dgae_jax.physics.jax import forward
 
+    engine.silence_warnings()
     builders = {
         "jax": forward.jax_engine,
         "mjx": mjx.mjx,

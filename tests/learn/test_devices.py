@@ -21,7 +21,7 @@ def found(tmp_path_factory):
     file = tmp_path_factory.mktemp("shared") / "runs.npz"
     program = [sys.executable, "-m", "tests.learn.test_devices", file]
     environment = {**os.environ, "JAX_PLATFORMS": "cpu"}
-    subprocess.run(program, cwd=ROOT, env=environment, check=True, timeout=900)
+    subprocess.run(program, cwd=ROOT, env=environment, check=True, timeout=300)
     return np.load(file)
 
 
